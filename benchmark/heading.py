@@ -12,8 +12,9 @@ from benchmark.line_truth import true_lines
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.heading import QUARTER_TURN, BuildingHeading
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
+from hmt_slam_ros.places.corridor_frame import BuildingHeading
+from hmt_slam_ros.places.observation_graph import QUARTER_TURN
 from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covariance
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario

@@ -24,8 +24,8 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.places.area_views import AreaViewCache
-from hmt_slam_ros.places.landmark_evidence import PlaceEvidence
-from hmt_slam_ros.places.loop_proposals import AreaLoop, LoopProposer
+from hmt_slam_ros.places.landmark_evidence import LoopProposer, PlaceEvidence
+from hmt_slam_ros.places.loop_detector import AreaLoop
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.topological_inference.branching import Branching
 

@@ -44,7 +44,7 @@ def filters_for(configuration: Configuration) -> Callable[[LocalMapping], Filter
         from hmt_slam_ros.submap.particle_filter import ParticleFilters  # noqa: PLC0415
 
         return ParticleFilters
-    from hmt_slam_ros.landmarks.filter_selection import FilterSelector  # noqa: PLC0415
+    from hmt_slam_ros.landmarks.line_filter import FilterSelector  # noqa: PLC0415
 
     return FilterSelector
 
@@ -62,7 +62,7 @@ def area_abstraction(configuration: Configuration, state: AamState | None = None
 def _opening_detector(configuration: Configuration) -> OpeningDetector | None:
     if configuration.aam.area_policy == "ncut":
         return None
-    from hmt_slam_ros.landmarks.opening_detection import LandmarkOpeningDetector  # noqa: PLC0415
+    from hmt_slam_ros.landmarks.area_landmarks import LandmarkOpeningDetector  # noqa: PLC0415
 
     return LandmarkOpeningDetector(configuration)
 

@@ -17,8 +17,8 @@ from hmt_slam_ros.results.log_reading import FIXED_PARAMETERS
 from hmt_slam_ros.saved_map.folder import FORMAT, SCANS, VERSION
 from hmt_slam_ros.saved_map.reference import document_reference
 from hmt_slam_ros.saved_map.scans import ScanTable
-from hmt_slam_ros.simulation.families import FAMILIES
 from hmt_slam_ros.simulation.settings import Settings
+from hmt_slam_ros.simulation.worlds import FAMILIES
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -7,10 +7,9 @@ from hmt_slam_ros.area_abstraction.doors import DoorTracker
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.landmarks.area_landmarks import LandmarkObservation
-from hmt_slam_ros.landmarks.beam_labels import Rays
+from hmt_slam_ros.landmarks.area_landmarks import LandmarkObservation, LandmarkOpenings
 from hmt_slam_ros.landmarks.landmarks import CONCAVE_CORNER, OPENING, ScanLandmarks
-from hmt_slam_ros.landmarks.opening_detection import LandmarkOpenings
+from hmt_slam_ros.landmarks.rays import Rays
 
 FEATURES = FeatureParameters()
 # Beams without returns: no landmark is missed.

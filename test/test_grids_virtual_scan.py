@@ -8,7 +8,8 @@ from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.grids.virtual_scan import cast_virtual_scan
-from hmt_slam_ros.landmarks.virtual_lines import extract_map_lines, rays_from_virtual_scan
+from hmt_slam_ros.landmarks.line_extraction import extract_map_lines
+from hmt_slam_ros.landmarks.rays import rays_from_virtual_scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 ROOM = box(-3.02, -2.01, 5.03, 4.02)

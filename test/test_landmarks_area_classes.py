@@ -16,7 +16,7 @@ from hmt_slam_ros.landmarks.area_classes import (
     measure_free_space,
     min_hallway_length,
 )
-from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
+from hmt_slam_ros.landmarks.rays import rays_from_scan
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 

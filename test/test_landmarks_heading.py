@@ -10,8 +10,9 @@ from benchmark import heading as measured
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
-from hmt_slam_ros.landmarks.heading import QUARTER_TURN, BuildingHeading
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
+from hmt_slam_ros.places.corridor_frame import BuildingHeading
+from hmt_slam_ros.places.observation_graph import QUARTER_TURN
 from hmt_slam_ros.sensors.motion_model import RelativeMotion
 
 FEATURES = FeatureParameters(range_deviation=0.01)

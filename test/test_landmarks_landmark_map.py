@@ -7,7 +7,6 @@ from worlds import box, scan_at
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
 from hmt_slam_ros.landmarks.landmark_map import LandmarkMap, scatter_ratio
 from hmt_slam_ros.landmarks.landmarks import (
     CONCAVE_CORNER,
@@ -17,6 +16,7 @@ from hmt_slam_ros.landmarks.landmarks import (
     should_be_visible,
 )
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
+from hmt_slam_ros.landmarks.rays import rays_from_scan
 
 NOISE = 0.01
 FEATURES = FeatureParameters(range_deviation=NOISE)

@@ -2,39 +2,20 @@
 
 import numpy as np
 import pytest
-from worlds import box, scan_at, scan_in
+from worlds import HALLWAY, box, scan_at, scan_in
 
 from benchmark.landmark_truth import World
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
-from hmt_slam_ros.landmarks.corners import extract_corners
+from hmt_slam_ros.landmarks.landmarks import extract_corners
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_lines
 from hmt_slam_ros.landmarks.openings import extract_openings
+from hmt_slam_ros.landmarks.rays import rays_from_scan
 from hmt_slam_ros.simulation import open_simulated
 
 NOISE = 0.01
 FEATURES = FeatureParameters(range_deviation=NOISE)
 ROOM = box(-3, -2, 5, 4)
-# A hallway of 2 m with a door of 1 m to a room on the left, and at its end another hallway to the right.
-HALLWAY = np.array(
-    [
-        [-6, -1, 4, -1],
-        [4, -1, 4, -6],
-        [6, -6, 6, 1],
-        [6, 1, 2.5, 1],
-        [2.5, 1, 2.5, 1.2],
-        [2.5, 1.2, 4, 1.2],
-        [4, 1.2, 4, 5],
-        [4, 5, -1, 5],
-        [-1, 5, -1, 1.2],
-        [-1, 1.2, 1.5, 1.2],
-        [1.5, 1.2, 1.5, 1],
-        [1.5, 1, -6, 1],
-        [-6, 1, -6, -1],
-    ],
-    dtype=float,
-)
 
 
 def corners_in(walls, pose, seed=0, beams=720):

@@ -7,7 +7,7 @@ from worlds import blank_scan, box, scan_in
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.landmarks.filter_selection import FilterSelector
+from hmt_slam_ros.landmarks.line_filter import FilterSelector
 from hmt_slam_ros.registration.consistency import WALLS_OF_SUBMAP
 from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe

@@ -12,8 +12,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.places.area_views import AreaViewCache
 from hmt_slam_ros.places.chart import build_chart
-from hmt_slam_ros.places.loop_detector import traversed_paths
-from hmt_slam_ros.places.loop_proposals import AreaLoopDetector, LoopProposer
+from hmt_slam_ros.places.landmark_evidence import LoopProposer
+from hmt_slam_ros.places.loop_detector import AreaLoopDetector, traversed_paths
 from hmt_slam_ros.simulation.building import FloorPlan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 

@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 import pytest
-from worlds import scan_at
+from worlds import HALLWAY, scan_at
 
 from benchmark.belief_world import drawn_anywhere, drawn_observation
 from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
-from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
-from hmt_slam_ros.landmarks.corners import Corners, extract_corners
+from hmt_slam_ros.landmarks.landmarks import Corners, extract_corners
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
 from hmt_slam_ros.landmarks.openings import Openings, extract_openings
+from hmt_slam_ros.landmarks.rays import rays_from_scan
 from hmt_slam_ros.places.observation import (
     ExpectedLandmarks,
     estimate_distance_past_node,
@@ -36,25 +36,6 @@ FEATURES = FeatureParameters(range_deviation=0.01)
 PLACES = PlaceParameters()
 MODEL = observation_model(PLACES, FEATURES)
 WHOLE = dataclasses.replace(PLACES, reach=6.0, aside=4.0)
-# A hallway of 2 m with a door of 1 m to a room on the left, and at its end another hallway to the right.
-HALLWAY = np.array(
-    [
-        [-6, -1, 4, -1],
-        [4, -1, 4, -6],
-        [6, -6, 6, 1],
-        [6, 1, 2.5, 1],
-        [2.5, 1, 2.5, 1.2],
-        [2.5, 1.2, 4, 1.2],
-        [4, 1.2, 4, 5],
-        [4, 5, -1, 5],
-        [-1, 5, -1, 1.2],
-        [-1, 1.2, 1.5, 1.2],
-        [1.5, 1.2, 1.5, 1],
-        [1.5, 1, -6, 1],
-        [-6, 1, -6, -1],
-    ],
-    dtype=float,
-)
 
 
 def graph_at(pose, axis):

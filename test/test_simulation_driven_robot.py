@@ -10,12 +10,12 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.building import Building, furniture_walls
+from hmt_slam_ros.simulation.drive import integrate_increments, noisy_increments
 from hmt_slam_ros.simulation.driven_robot import DrivenLog, DrivenRobot
 from hmt_slam_ros.simulation.laser import clearance
 from hmt_slam_ros.simulation.people import People, ReactivePeople
 from hmt_slam_ros.simulation.scenario import START, Scenario
 from hmt_slam_ros.simulation.settings import Settings
-from hmt_slam_ros.simulation.wheels import integrate_increments, noisy_increments
 
 ROOM = furniture_walls(np.array([[0.0, 0.0, 0.0, 12.0, 8.0]]))
 ROUTE = np.array([[-4.0, 0.0], [4.0, 0.0]])

@@ -20,7 +20,7 @@ from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.simulation import FAMILIES, SimulatedLog
 from hmt_slam_ros.simulation.building import outline_of_cells
-from hmt_slam_ros.simulation.world_file import read_world
+from hmt_slam_ros.simulation.worlds import read_world
 
 MALAGA = Path(__file__).parents[1] / "data" / "malaga_one_loop"
 
@@ -103,7 +103,7 @@ def test_a_bag_of_a_simulated_log_is_the_same_log_and_knows_the_truth(tmp_path, 
 def test_a_bag_of_a_real_robot_knows_no_truth():
     log = open_log(MALAGA)
     assert all(record.true_pose is None for record in log.records())
-    with pytest.raises(HmtSlamError, match="does not tell the truth"):
+    with pytest.raises(HmtSlamError, match="has no true poses"):
         read_true_poses(log)
 
 

@@ -8,7 +8,7 @@ from hmt_slam_ros.area_abstraction.overlap_graph import overlaps, sensed_points
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.simulation.laser import Laser, wall_index
 from hmt_slam_ros.simulation.settings import Settings
-from hmt_slam_ros.simulation.sight import same_place, shared_view
+from hmt_slam_ros.simulation.simulated_log import same_place, shared_view
 
 # Two rooms of 6 m x 6 m with a wall between them at x = 6 m that has a door of 1 m.
 ROOMS = np.array(

@@ -9,7 +9,7 @@ from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors.motion_model import NO_MOTION, RelativeMotion, increment_covariance
 from hmt_slam_ros.simulation import open_simulated
-from hmt_slam_ros.simulation.wheels import draw_slips, integrate_increments, noisy_increments
+from hmt_slam_ros.simulation.drive import draw_slips, integrate_increments, noisy_increments
 
 RUNS = 100
 # 95 % band of the mean over 100 runs of a chi-square with 3 degrees of freedom.

@@ -10,8 +10,8 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.places.landmark_evidence import PlaceEvidence
-from hmt_slam_ros.places.loop_proposals import AreaLoop, LoopProposer
+from hmt_slam_ros.places.landmark_evidence import LoopProposer, PlaceEvidence
+from hmt_slam_ros.places.loop_detector import AreaLoop
 
 SPREAD = np.diag([0.15, 0.15, math.radians(1.5)]) ** 2
 # Largest deviation of an area's position that is searched, m: none behind the ring.

@@ -13,6 +13,26 @@ from hmt_slam_ros.simulation.laser import cast_rays, wall_index
 
 RANGE_MAX = 30.0
 
+HALLWAY = np.array(
+    [
+        [-6, -1, 4, -1],
+        [4, -1, 4, -6],
+        [6, -6, 6, 1],
+        [6, 1, 2.5, 1],
+        [2.5, 1, 2.5, 1.2],
+        [2.5, 1.2, 4, 1.2],
+        [4, 1.2, 4, 5],
+        [4, 5, -1, 5],
+        [-1, 5, -1, 1.2],
+        [-1, 1.2, 1.5, 1.2],
+        [1.5, 1.2, 1.5, 1],
+        [1.5, 1, -6, 1],
+        [-6, 1, -6, -1],
+    ],
+    dtype=float,
+)
+"""A hallway of 2 m with a door of 1 m to a room on the left, and at its end another hallway to the right."""
+
 
 def box(x0, y0, x1, y1):
     """The four walls of a room."""

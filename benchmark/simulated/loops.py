@@ -24,7 +24,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.sensors.motion_model import increment_covariance
 from hmt_slam_ros.simulation import SimulatedLog
-from hmt_slam_ros.simulation.sight import same_place
+from hmt_slam_ros.simulation.simulated_log import same_place
 
 OLD = 10.0
 """Path between two keyframes from which on the second enters again, m."""

@@ -1,4 +1,4 @@
-"""How good a trajectory is: files of stamped poses, and errors of relations between them."""
+"""Evaluation of trajectories: files of stamped poses, and errors of relations between them."""
 
 from hmt_slam_ros.evaluation.relations import (
     ErrorStatistics,

@@ -1,7 +1,7 @@
 """Errors of a trajectory at relations between two of its poses (Kuemmerle et al. 2009), and true relations.
 
-A relation is the true pose at one time in the frame of the pose at another. It needs no common frame and does not
-count an early error of heading again and again, as a comparison of absolute poses would.
+A relation is the true pose at one time in the frame of the pose at another. It needs no common frame, and an early
+error of heading counts once, unlike in a comparison of absolute poses.
 """
 
 from __future__ import annotations
@@ -22,7 +22,16 @@ MAX_TIME_GAP = NANOSECONDS // 10
 """Largest time between a relation's end and the pose taken for it, ns."""
 
 LONG_SPAN = 60 * NANOSECONDS
-"""Relations that span more time than this, in ns, are the ones that a missed loop shows in."""
+"""Shortest time span of relations in which a missed loop shows, ns."""
+
+_SPACING = 1.0
+"""Traveled distance between poses with true relations, m."""
+
+_FAR = 10
+"""Poses between both ends of the longer true relations."""
+
+_SAME_PLACE_RADIUS = 3.0
+"""Largest distance between poses of one place, m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +50,7 @@ class Relations:
 
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Of absolute errors: mean, sample standard deviation (n - 1), root of the mean square, largest; NaN for none."""
+    """Mean, sample standard deviation (n - 1), root mean square and maximum of absolute errors; NaN for none."""
 
     mean: float
     std: float
@@ -56,7 +65,7 @@ class RelationScore:
     :ivar count: relations in the set.
     :ivar matched: relations with a pose at both ends.
     :ivar missed: all others.
-    :ivar extrapolated: matched relations of which one end or both were reached along the odometry.
+    :ivar extrapolated: matched relations with an end that was extrapolated along the odometry.
     :ivar translation: norm of the difference of the two translations, meters.
     :ivar rotation: absolute difference of heading, degrees.
     """
@@ -71,7 +80,7 @@ class RelationScore:
 
 @dataclass(frozen=True)
 class RelationErrors:
-    """Errors over all relations, and over those alone that span more than 60 s."""
+    """Errors over all relations, and over those that span more than 60 s."""
 
     overall: RelationScore
     over_60_s: RelationScore
@@ -84,8 +93,8 @@ class PairErrors:
     :ivar translation: norm of the difference of the two translations, meters.
     :ivar rotation: absolute difference of heading, degrees.
     :ivar span: time between the two poses, ns, int64.
-    :ivar is_matched: whether there is a pose at both ends; where not, the errors mean nothing.
-    :ivar is_extrapolated: whether one end or both were reached along the odometry.
+    :ivar is_matched: whether there is a pose at both ends; if not, the errors are meaningless.
+    :ivar is_extrapolated: whether an end was extrapolated along the odometry.
     """
 
     translation: NDArray[np.float64]
@@ -98,7 +107,7 @@ class PairErrors:
 def read_relations(path: Path) -> Relations:
     """Relations from lines ``t1 t2 x y z roll pitch yaw`` (s, m, rad); ``#`` begins a comment.
 
-    :raises HmtSlamError: where the file cannot be read, is empty or has a malformed line.
+    :raises HmtSlamError: if the file cannot be read, is empty or has a malformed line.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -127,9 +136,8 @@ def read_relations(path: Path) -> Relations:
 def evaluate_folder(output_dir: Path, relations_file: Path, odometry_log: Path | None = None) -> RelationErrors:
     """Errors of the trajectory.tum of an output folder.
 
-    :param odometry_log: the log that it was made from, to carry poses along its odometry where there is no pose
-        within 0.1 s.
-    :raises HmtSlamError: where one of the files cannot be read.
+    :param odometry_log: its log, to extrapolate poses along the odometry where there is none within 0.1 s.
+    :raises HmtSlamError: if one of the files cannot be read.
     """
     trajectory = read_tum(output_dir / "trajectory.tum")
     odometry = None if odometry_log is None else read_odometry_poses(open_log(odometry_log))
@@ -159,30 +167,29 @@ def evaluate_relations(
 def pair_errors(trajectory: StampedPoses, relations: Relations, odometry: StampedPoses | None = None) -> PairErrors:
     """Errors of a trajectory at each relation.
 
-    The pose at a stamp is the one nearest in time if that is within 0.1 s. Else, with odometry, the nearest pose is
-    moved by the odometry between the two times, each of which must have a reading within 0.1 s. Else the relation is
-    missed.
+    The pose at a stamp is the nearest one within 0.1 s. Else it is the nearest one, extrapolated along the odometry
+    between the two times, if both have a reading within 0.1 s. Else the relation is missed.
 
     :param trajectory: under test, with source stamps.
     :param relations: the truth.
     :param odometry: raw wheel odometry with source stamps.
     """
-    starts, start_found, start_carried = _poses_at(relations.starts, trajectory, odometry)
-    ends, end_found, end_carried = _poses_at(relations.ends, trajectory, odometry)
+    starts, start_found, start_extrapolated = _poses_at(relations.starts, trajectory, odometry)
+    ends, end_found, end_extrapolated = _poses_at(relations.ends, trajectory, odometry)
     estimates = se2.between(starts, ends)
     return PairErrors(
         translation=np.hypot(*(estimates[:, :2] - relations.poses[:, :2]).T),
         rotation=np.rad2deg(np.abs(se2.wrap(estimates[:, 2] - relations.poses[:, 2]))),
         span=np.abs(relations.ends - relations.starts),
         is_matched=start_found & end_found,
-        is_extrapolated=start_carried | end_carried,
+        is_extrapolated=start_extrapolated | end_extrapolated,
     )
 
 
 def _poses_at(
     stamps: NDArray[np.int64], trajectory: StampedPoses, odometry: StampedPoses | None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pose at each stamp (n, 3), whether there is one, and whether it was carried there along the odometry."""
+    """Pose at each stamp (n, 3), whether there is one, and whether it was extrapolated along the odometry."""
     nearest = trajectory.nearest_indices(stamps)
     poses, times = trajectory.poses[nearest], trajectory.stamps[nearest]
     near = np.abs(times - stamps) <= MAX_TIME_GAP
@@ -192,9 +199,9 @@ def _poses_at(
     covered = (np.abs(odometry.stamps[begin] - times) <= MAX_TIME_GAP) & (
         np.abs(odometry.stamps[end] - stamps) <= MAX_TIME_GAP
     )
-    carried = ~near & covered
+    extrapolated = ~near & covered
     moved = se2.compose(poses, se2.between(odometry.poses[begin], odometry.poses[end]))
-    return np.where(carried[:, None], moved, poses), near | covered, carried
+    return np.where(extrapolated[:, None], moved, poses), near | covered, extrapolated
 
 
 def _statistics(errors: NDArray[np.float64]) -> ErrorStatistics:
@@ -205,7 +212,7 @@ def _statistics(errors: NDArray[np.float64]) -> ErrorStatistics:
 
 
 def format_table(errors: RelationErrors) -> str:
-    """The errors as a table of fixed-width lines, with the share of relations matched and the policy."""
+    """The errors as a table of fixed-width lines, with the share of matched relations and the matching policy."""
     header = (
         f"{'relations':<10} {'matched':>18} {'carried':>8} "
         f"{'translation [m]':>18} {'rms':>7} {'max':>7} {'rotation [deg]':>18} {'rms':>7} {'max':>7}"
@@ -224,22 +231,16 @@ def _table_row(name: str, score: RelationScore) -> str:
     return f"{name:<10} {matched:>18} {score.extrapolated:>8} {errors[0]} {errors[1]}"
 
 
-_SPACING = 1.0  # m, driven from one pose to the next
-_FAR = 10  # poses
-_NEAR = 3.0  # m, within which a place is the same
-
-
 def true_relations(truth: StampedPoses) -> Relations:
-    """Relations of every meter of a drive: to the next, to the tenth, and to where the robot was before.
+    """True relations of the poses of every meter: to the next, to the tenth, and to an earlier visit of the place.
 
-    The third kind joins each pose to the nearest one, within 3 m, of more than 60 s before; over these a missed loop
-    shows.
+    The earlier pose is the nearest one within 3 m and more than 60 s before. In these relations a missed loop shows.
 
     :param truth: in the order of time.
     """
     steps = np.hypot(*np.diff(truth.poses[:, :2], axis=0).T)
-    metres = np.floor(np.concatenate(([0.0], np.cumsum(steps))) / _SPACING)
-    chosen = np.flatnonzero(np.diff(metres, prepend=-1.0) > 0.0)
+    meters = np.floor(np.concatenate(([0.0], np.cumsum(steps))) / _SPACING)
+    chosen = np.flatnonzero(np.diff(meters, prepend=-1.0) > 0.0)
     stamps, poses = truth.stamps[chosen], truth.poses[chosen]
     ahead = np.arange(len(chosen))
     pairs = [np.stack((ahead[:-gap], ahead[gap:]), axis=1) for gap in (1, _FAR) if len(chosen) > gap]
@@ -255,6 +256,6 @@ def _revisits(stamps: NDArray[np.int64], poses: NDArray[np.float64]) -> NDArray[
         if long_ago:
             distances = np.hypot(*(poses[:long_ago, :2] - poses[k, :2]).T)
             nearest = int(np.argmin(distances))
-            if distances[nearest] < _NEAR:
+            if distances[nearest] < _SAME_PLACE_RADIUS:
                 pairs.append((nearest, k))
     return np.array(pairs, dtype=np.intp).reshape(-1, 2)

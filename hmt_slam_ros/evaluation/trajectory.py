@@ -27,9 +27,9 @@ class StampedPoses:
     poses: NDArray[np.float64]
 
     def nearest_indices(self, stamps: NDArray[np.int64]) -> NDArray[np.intp]:
-        """Index of the pose nearest in time to each of some stamps.
+        """Index of the pose nearest in time to each stamp.
 
-        Of poses with the same stamp the first counts; of two equally near ones, the earlier.
+        Of poses with the same stamp it is the first, and of two equally near ones the earlier.
 
         :param stamps: shape (m,), ns.
         :returns: shape (m,).
@@ -45,7 +45,7 @@ class StampedPoses:
 def read_tum(path: Path) -> StampedPoses:
     """Poses of a TUM file, in file order; stamps are exact to the ns.
 
-    :raises HmtSlamError: where the file cannot be read, is empty or has a malformed line.
+    :raises HmtSlamError: if the file cannot be read, is empty or has a malformed line.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -80,12 +80,12 @@ def write_tum(path: Path, trajectory: StampedPoses) -> None:
 def read_true_poses(log: Log) -> StampedPoses:
     """The true pose at every scan of a log, with its source stamp.
 
-    :raises HmtSlamError: where the log does not know it.
+    :raises HmtSlamError: for a log without true poses.
     """
     scans = [record for record in log.records() if isinstance(record.measurement, Scan)]
     poses = [record.true_pose for record in scans if record.true_pose is not None]
     if len(poses) < len(scans):
-        raise HmtSlamError(f"{log.name} does not tell the truth: give a simulated log, or a bag of one.")
+        raise HmtSlamError(f"{log.name} has no true poses: give a simulated log, or a bag of one.")
     return StampedPoses(np.array([record.source_stamp for record in scans], dtype=np.int64), np.array(poses))
 
 

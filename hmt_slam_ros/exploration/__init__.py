@@ -1,1 +1,1 @@
-"""What a robot does next to get to know a building, and how it gets to places that it knows; without ROS."""
+"""Exploration of buildings and missions to known places, without ROS."""

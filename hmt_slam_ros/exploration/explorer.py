@@ -1,66 +1,191 @@
-"""The explorer: drives the robot until the building is known, hallways first and then rooms, and to named places.
+"""The explorer: drives a robot until a building is known, hallways before rooms, and to named places.
 
-Tomatis, Nourbakhsh and Siegwart (2003): all hallways depth first, then the rooms by backtracking. What is depth first
-in a building, whose crossings have few arms, is to go to the nearest end of known ground: behind a crossing that is the
-hallway ahead, in a dead end the arm of the last crossing that was left out.
+Tomatis, Nourbakhsh and Siegwart (2003): all hallways depth first, then the rooms by backtracking. In a building, whose
+crossings have few arms, depth first is to go to the nearest frontier: behind a crossing the hallway ahead, in a dead
+end the last arm that was left out.
 """
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.exploration.exploration_map import ExplorationMap
-from hmt_slam_ros.exploration.path_follower import PathFollower, Route, motion_limits
-from hmt_slam_ros.exploration.roadmap import EntryPoint, Frontier
+from hmt_slam_ros.exploration.path_follower import KeyframeLocator, PathFollower, Route, motion_limits
+from hmt_slam_ros.exploration.roadmap import EntryPoint, Frontier, Roadmap
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.messages.messages import Message
+from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message, RealTimePose
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.tasks import GoalPose, Task, TaskResult, VelocityCommand
 from hmt_slam_ros.sensors import Scan
 
-# So near a frontier and a place are reached, m.
-_AT_FRONTIER, _AT_PLACE = 0.5, 0.15
-# So near a frontier nothing more is seen from it where the robot does not get nearer, m.
+_MAX_POSE_AGE = NANOSECONDS
+"""Age up to which a pose of RTL is used, ns; RTL sends none while the robot is lost."""
+
+_FRONTIER_TOLERANCE, _PLACE_TOLERANCE = 0.5, 0.15
+"""Distance at which a frontier and a place are reached, m."""
+
 _BESIDE_FRONTIER = 1.0
-# So near to a frontier in a hallway it is chosen anew, since it moves on, m.
+"""Distance of a stuck robot from a frontier up to which this counts as reached, m."""
+
 _RESELECT_DISTANCE = 3.0
-# Frontiers nearer to each other than this, m, are one.
-_SAME = 0.7
-# How often a way to a place is looked for anew where the robot is held up.
+"""Remaining distance to a frontier in a hallway at which a new one is chosen, as it moves on, m."""
+
+_SAME_FRONTIER_DISTANCE = 0.7
+"""Frontiers nearer to each other than this are one, m."""
+
 _TRIES = 3
+"""Routes to a place before a task is given up."""
+
 _STAND = (0.0, 0.0)
 
 
-class Explorer:
-    """The explorer as a process. Consumes Task, Scan, RealTimePose and the chain; says what tasks.py has.
+class ExplorationMap:
+    """The map of the most probable hypothesis, with roadmap, named rooms and the robot in it.
 
-    :ivar exploration_map: what it knows.
+    :ivar roadmap: of the building.
+    :ivar replica: maps and scans.
+    """
+
+    def __init__(self, configuration: Configuration, replica: Replica | None = None) -> None:
+        """:param replica: the initial map; None for an empty one."""
+        parameters = configuration.explorer
+        self.roadmap = Roadmap(configuration.features, parameters.radius + parameters.margin, parameters.door)
+        self.replica = replica or Replica()
+        self._pose: RealTimePose | None = None
+        self._keyframe_locator: KeyframeLocator | None = None
+        # Of each entered room the keyframes around the robot's pose there, the nearest first.
+        self._rooms: list[tuple[int, ...]] = []
+        self.roadmap.update_everywhere(self.hybrid_map, self.replica.scans)
+        for room in self.roadmap.rooms():
+            self._add_room(room)
+
+    def on_message(self, message: Message) -> None:
+        """Process a message of the chain or a pose; between nodes, scans may arrive after any of them."""
+        if isinstance(message, Keyframe | Hypotheses | ClosureDecision):
+            self.replica.apply_message(message)
+            self._keyframe_locator = None
+        elif isinstance(message, RealTimePose):
+            self._pose = message
+
+    @property
+    def hybrid_map(self) -> HybridMap:
+        """The map of the most probable hypothesis."""
+        return self.replica.maps[self.replica.best_hypothesis]
+
+    @property
+    def entropy(self) -> float:
+        """Entropy of the probabilities of topological paths, nats."""
+        return -sum(each * math.log(each) for each in self.replica.probabilities.values() if each > 0.0)
+
+    def is_localized(self, stamp: int) -> bool:
+        """Whether a pose of the robot in the map is known at a time, ns."""
+        pose = self._pose
+        return pose is not None and abs(stamp - pose.stamp) <= _MAX_POSE_AGE and self.hybrid_map.has_area(pose.area)
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether map or area changed since the last `keyframe_locator`."""
+        return self._keyframe_locator is None or self._pose is None or self._keyframe_locator.area != self._pose.area
+
+    @property
+    def pose(self) -> RealTimePose:
+        """The last pose of the robot; valid if `is_localized`."""
+        assert self._pose is not None
+        return self._pose
+
+    @property
+    def keyframe_locator(self) -> KeyframeLocator:
+        """Poses of keyframes relative to the robot's area."""
+        if self._keyframe_locator is None or self.has_changed:
+            self._keyframe_locator = KeyframeLocator(self.hybrid_map, self.pose.area)
+        return self._keyframe_locator
+
+    def update_roadmap(self) -> EntryPoint | None:
+        """Update the roadmap around the robot, and return the path to it, None for none."""
+        pose = self.pose
+        return self.roadmap.update(self.hybrid_map, self.replica.scans, pose.area, pose.pose_in_area.mean)
+
+    def route_in_base(self, route: Route) -> Float64:
+        """The points of a route (n, 2) in the frame of the base now, m."""
+        return self.keyframe_locator.route_in_base(route, self.pose.pose_in_area.mean)
+
+    def goal_pose(self, route: Route) -> tuple[int, Float64]:
+        """The end of a route: its area, and ``area_T_goal`` (3,) with the heading of the route there."""
+        last = route.points[-2:]
+        towards = last[-1] - last[0]
+        area, pose = self.keyframe_locator.area_and_pose(route.keyframes[-1])
+        return area, se2.compose(pose, np.array([*last[-1], np.arctan2(towards[1], towards[0])]))
+
+    def name_current_room(self) -> None:
+        """Name the room that the robot is in, if it has no name."""
+        here = self.update_roadmap()
+        if here is not None:
+            self._add_room(self.roadmap.room_around(here.keyframe))
+
+    def _add_room(self, room: tuple[int, ...]) -> None:
+        if room and len(self._named_rooms([*self._rooms, room])) > len(self._named_rooms(self._rooms)):
+            self._rooms.append(room)
+
+    def _named_rooms(self, rooms: list[tuple[int, ...]]) -> dict[str, int]:
+        """{name: keyframe} of rooms, with the nearest keyframe that is not pruned.
+
+        A room that was entered twice, before a loop closure showed it, has its first name. A segment that is classified
+        as hallway by now has none.
+        """
+        current = filter(self.roadmap.is_room, self.roadmap.segments())
+        segment_of = {keyframe: number for number, segment in enumerate(current) for keyframe in segment}
+        named: dict[int, tuple[str, int]] = {}
+        for number, room in enumerate(rooms, 1):
+            keyframe = next((keyframe for keyframe in room if keyframe in segment_of), None)
+            if keyframe is not None:
+                named.setdefault(segment_of[keyframe], (f"room {number}", keyframe))
+        return dict(named.values())
+
+    def named_places(self) -> dict[str, int]:
+        """{name: keyframe in its middle} of entered rooms and of areas."""
+        named = self._named_rooms(self._rooms)
+        hybrid_map = self.hybrid_map
+        for area in hybrid_map.area_ids():
+            keyframes = {k: pose for k, pose in hybrid_map.keyframes(area).items() if k in self.roadmap.graph}
+            if keyframes:
+                positions = np.array(list(keyframes.values()))[:, :2]
+                distances = np.hypot(*(positions - positions.mean(axis=0)).T)
+                named[f"area {area}"] = list(keyframes)[int(np.argmin(distances))]
+        return named
+
+
+class Explorer:
+    """The explorer as a process. Consumes Task, Scan, RealTimePose and the chain; produces messages of tasks.py.
+
+    :ivar exploration_map: the known map.
     """
 
     def __init__(self, configuration: Configuration, known: Replica | None = None) -> None:
-        """:param known: the map at first, None for none."""
-        own = configuration.explorer
-        self._limits = motion_limits(own)
-        self._stuck_timeout = round(NANOSECONDS * own.stuck_timeout)
+        """:param known: the initial map; None for an empty one."""
+        parameters = configuration.explorer
+        self._limits = motion_limits(parameters)
+        self._stuck_timeout = round(NANOSECONDS * parameters.stuck_timeout)
         self.exploration_map = ExplorationMap(configuration, known)
         self._task: Task | None = None
         self._tries = 0
         self._target: Frontier | None = None
         self._route: Route | None = None
-        self._path_follower = PathFollower(self._limits, _AT_PLACE)
+        self._path_follower = PathFollower(self._limits, _PLACE_TOLERANCE)
         self._velocity = _STAND
-        # Frontiers where it was, and others that it did not reach: each a place in the frame of a keyframe.
+        # Reached frontiers, and those given up: each a point in the frame of a keyframe.
         self._reached_frontiers: list[tuple[int, Float64]] = []
         self._abandoned_frontiers: list[tuple[int, Float64]] = []
         self._may_retry = True
-        self._max_path_entropy = configuration.places.max_entropy if own.backtracks else math.inf
+        self._max_path_entropy = configuration.places.max_entropy if parameters.backtracks else math.inf
         self._is_backtracking = False
 
     def handle(self, message: Message) -> list[Message]:
-        """Take in one message; a scan is answered with velocities."""
+        """Process one message; a scan is answered with velocities."""
         if isinstance(message, Task):
             self._task = None if message.kind == "stop" else message
             self._route, self._tries, self._may_retry = None, 0, True
@@ -71,28 +196,25 @@ class Explorer:
         return []
 
     def _drive(self, scan: Scan) -> list[Message]:
-        said: list[Message] = []
+        """Choose a goal if there is none, and follow the route."""
+        outputs: list[Message] = []
         ready = self.exploration_map.is_localized(scan.stamp)
         if ready and self._task is not None:
             if self.exploration_map.has_changed and not self._keeps_route():
                 self._route = None
             if self._route is None:
-                said += self._choose_goal(self._task, scan.stamp)
-        self._velocity = self._follow_route(scan, said) if ready and self._route is not None else _STAND
-        return [*said, VelocityCommand(scan.stamp, *self._velocity)]
+                outputs += self._choose_goal(self._task, scan.stamp)
+        self._velocity = self._follow_route(scan, outputs) if ready and self._route is not None else _STAND
+        return [*outputs, VelocityCommand(scan.stamp, *self._velocity)]
 
     def _keeps_route(self) -> bool:
-        """Whether it goes on to where it went."""
+        """Whether the route is still valid after a change of the map."""
         if self._route is None or not self.exploration_map.keyframe_locator.contains_route(self._route):
             return False
         if self._is_backtracking or self._is_ambiguous:
             return self._is_backtracking and self._is_ambiguous
-        return not (
-            self._is_exploring
-            and self._target
-            and self._target.is_in_hallway
-            and self._path_follower.remaining < _RESELECT_DISTANCE
-        )
+        in_hallway = self._is_exploring and self._target is not None and self._target.is_in_hallway
+        return not (in_hallway and self._path_follower.remaining < _RESELECT_DISTANCE)
 
     @property
     def _is_exploring(self) -> bool:
@@ -100,29 +222,28 @@ class Explorer:
 
     @property
     def _is_ambiguous(self) -> bool:
-        """Whether it turns back until one topological path has nearly all of the probability, as the paper's robot."""
+        """Whether the entropy of topological paths requires backtracking, as in the paper."""
         return self._is_exploring and self.exploration_map.entropy >= self._max_path_entropy
 
-    def _follow_route(self, scan: Scan, said: list[Message]) -> tuple[float, float]:
-        """The velocities along the route; where that ends, what there is to say is added."""
+    def _follow_route(self, scan: Scan, outputs: list[Message]) -> tuple[float, float]:
+        """The velocities along the route; messages at its end are added to ``outputs``."""
         assert self._route is not None
         command = self._path_follower.steer(scan, self.exploration_map.route_in_base(self._route), self._velocity)
         if self._path_follower.has_arrived or self._path_follower.is_stuck(scan.stamp, self._stuck_timeout):
-            # What is to be seen at a frontier is seen from beside it.
+            # A frontier is visible from beside it.
             near = self._is_exploring and self._path_follower.remaining <= _BESIDE_FRONTIER
-            said += self._finish_route(reached=self._path_follower.has_arrived or near)
+            outputs += self._finish_route(reached=self._path_follower.has_arrived or near)
         return command.speed, command.turn_rate
 
     def _finish_route(self, *, reached: bool) -> list[Message]:
-        """The route is at its end."""
+        """End the route, and with it the task to go to a place."""
         self._route = None
         if self._is_backtracking:
             return []
         if self._is_exploring:
             assert self._target is not None
-            (self._reached_frontiers if reached else self._abandoned_frontiers).append(
-                (self._target.keyframe, self._target.path[-1])
-            )
+            frontiers = self._reached_frontiers if reached else self._abandoned_frontiers
+            frontiers.append((self._target.keyframe, self._target.path[-1]))
             self._may_retry |= reached
             if reached and not self._target.is_in_hallway:
                 self.exploration_map.name_current_room()
@@ -136,73 +257,75 @@ class Explorer:
 
     def _finish_task(self, text: str, *, reached: bool) -> list[Message]:
         assert self._task is not None
-        outcome = TaskResult(self._task, reached, text)
+        result = TaskResult(self._task, reached, text)
         self._task = self._route = None
-        return [outcome]
+        return [result]
 
     def _choose_goal(self, task: Task, stamp: int) -> list[Message]:
-        """Choose where to go."""
+        """Plan a route for a task."""
         here = self.exploration_map.update_roadmap()
         if here is None:
             return []
         self._is_backtracking = self._is_ambiguous
-        choose = {"explore": self._plan_to_frontier, "go": self._plan_to_place, "backtrack": self._plan_backtracking}[
-            task.kind
-        ]
-        said = self._plan_backtracking(here) if self._is_backtracking else choose(here)
+        planners = {"explore": self._plan_to_frontier, "go": self._plan_to_place, "backtrack": self._plan_backtracking}
+        plan = self._plan_backtracking if self._is_backtracking else planners[task.kind]
+        outputs = plan(here)
         if self._route is not None:
             area, goal = self.exploration_map.goal_pose(self._route)
-            said.append(GoalPose(stamp, area, goal))
-        return said
+            outputs.append(GoalPose(stamp, area, goal))
+        return outputs
 
     def _set_route(self, here: EntryPoint, keyframes: list[int], last: Float64, tolerance: float) -> None:
         self._route = Route.through_keyframes(here.path, keyframes, last)
         self._path_follower = PathFollower(self._limits, tolerance)
 
     def _plan_to_frontier(self, here: EntryPoint) -> list[Message]:
-        """Choose the nearest frontier in a hallway, else the nearest one."""
-        survey = self.exploration_map.roadmap
-        distances = survey.distances(here.keyframe)
+        """Plan to the nearest frontier in a hallway, else to the nearest one."""
+        roadmap = self.exploration_map.roadmap
+        distances = roadmap.distances(here.keyframe)
         choices = [
-            (not one.is_in_hallway, distances[one.keyframe] + one.length, number)
-            for number, one in enumerate(survey.frontiers)
-            if one.keyframe in distances and not self._was_tried(one)
+            (not frontier.is_in_hallway, distances[frontier.keyframe] + frontier.length, number)
+            for number, frontier in enumerate(roadmap.frontiers)
+            if frontier.keyframe in distances and not self._was_tried(frontier)
         ]
         if not choices:
             return self._retry_or_finish()
-        target = self._target = survey.frontiers[min(choices)[2]]
-        self._set_route(here, survey.shortest_path(here.keyframe, target.keyframe), target.path, _AT_FRONTIER)
+        target = self._target = roadmap.frontiers[min(choices)[2]]
+        self._set_route(here, roadmap.shortest_path(here.keyframe, target.keyframe), target.path, _FRONTIER_TOLERANCE)
         return []
 
     def _retry_or_finish(self) -> list[Message]:
-        """Nothing is left; what was given up, maybe because of people, is tried anew until none of it is reached."""
+        """Retry frontiers that were given up, maybe because of people, while any of them is reached; else finish."""
         if self._abandoned_frontiers and self._may_retry:
             self._may_retry, self._abandoned_frontiers = False, []
             return []
         left = len(self._abandoned_frontiers)
         return self._finish_task(f"all is known that can be reached; {left} places were given up", reached=True)
 
-    def _was_tried(self, one: Frontier) -> bool:
-        frames = self.exploration_map.keyframe_locator
-        place = se2.transform(frames.keyframe_pose(one.keyframe), one.path[-1])
+    def _was_tried(self, frontier: Frontier) -> bool:
+        """Whether a frontier was reached or given up."""
+        locator = self.exploration_map.keyframe_locator
+        position = se2.transform(locator.keyframe_pose(frontier.keyframe), frontier.path[-1])
         return any(
-            math.dist(place, se2.transform(frames.keyframe_pose(keyframe), point)) < _SAME
+            math.dist(position, se2.transform(locator.keyframe_pose(keyframe), point)) < _SAME_FRONTIER_DISTANCE
             for keyframe, point in self._reached_frontiers + self._abandoned_frontiers
-            if keyframe in frames
+            if keyframe in locator
         )
 
     def _plan_to_place(self, here: EntryPoint) -> list[Message]:
+        """Plan to a named place."""
         assert self._task is not None
-        places, survey = self.exploration_map.named_places(), self.exploration_map.roadmap
+        places, roadmap = self.exploration_map.named_places(), self.exploration_map.roadmap
         keyframe = places.get(self._task.place)
         if keyframe is None:
             return self._finish_task(f"there is no such place: choose from {', '.join(places)}", reached=False)
-        if keyframe not in survey.distances(here.keyframe):
+        if keyframe not in roadmap.distances(here.keyframe):
             return self._finish_task("no way is known that leads there", reached=False)
-        self._set_route(here, survey.shortest_path(here.keyframe, keyframe), here.path[:0], _AT_PLACE)
+        self._set_route(here, roadmap.shortest_path(here.keyframe, keyframe), here.path[:0], _PLACE_TOLERANCE)
         return []
 
     def _plan_backtracking(self, here: EntryPoint) -> list[Message]:
-        """Back along the robot's own path."""
-        self._set_route(here, self.exploration_map.roadmap.backtracking_path(here.keyframe), here.path[:0], _AT_PLACE)
+        """Plan back along the robot's path."""
+        path = self.exploration_map.roadmap.backtracking_path(here.keyframe)
+        self._set_route(here, path, here.path[:0], _PLACE_TOLERANCE)
         return []

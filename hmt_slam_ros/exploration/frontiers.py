@@ -1,6 +1,6 @@
-"""The ground around an area: where a robot can go, and where what is known of it ends (frontiers; Yamauchi, 1997).
+"""Navigation grid around the robot: free cells, shortest paths, and frontiers (Yamauchi 1997).
 
-One search of scipy's serves all paths of a grid. Roadmaps and policies have few nodes with names: networkx does there.
+A single search of scipy serves all paths of a grid.
 """
 
 from __future__ import annotations
@@ -17,27 +17,35 @@ from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.grids.occupancy_map import OCCUPIED, UNKNOWN, occupancy_image
 from hmt_slam_ros.sensors import Scan
 
-_CELL = 0.1  # m
-# A beam tells of ground up to here, m: beyond, doors are seen too much askew, and there are gaps between beams.
-KEYFRAME_RANGE = 4.0
-"""So far a keyframe shows ground, m."""
+_CELL = 0.1
+"""Side of a cell, m."""
 
-# Cells of a frontier at least, and how much farther from surfaces than the robot has to keep they are, m.
-_LEAST, _FRONTIER_CLEARANCE = 3, 0.1
-# A part of the ground is a room of its own from this size on, m^2.
-_PART = 0.5
-# A place that is too near to a surface is got to by way of the next one that is not, up to so far away, m.
-_ASIDE = 0.5
-# A cell costs up to so many times more the nearer it is to a surface, up to so many m beyond the radius.
+KEYFRAME_RANGE = 4.0
+"""Range of a keyframe's beams in the grid, m: farther on, doors are at grazing angles, and beams leave gaps."""
+
+_MIN_FRONTIER_CELLS = 3
+"""Cells of a frontier, at least."""
+
+_FRONTIER_CLEARANCE = 0.1
+"""Distance of a frontier from surfaces beyond the robot's clearance, m."""
+
+_MIN_ROOM_SIZE = 0.5
+"""Free ground of an unvisited room, at least, m^2."""
+
+_MAX_DETOUR = 0.5
+"""Largest distance between a position and the reachable cell that replaces it, m."""
+
 _INFLATION_COST, _INFLATION_DISTANCE = 2.0, 0.4
-_AROUND = np.ones((3, 3), dtype=np.bool_)
+"""Additional cost of a cell at a surface, in cells, and the distance beyond the clearance at which it is 0, m."""
+
+_NEIGHBORS = np.ones((3, 3), dtype=np.bool_)
 
 
 class GridPath(NamedTuple):
-    """The way to a place from the keyframe from which that is shortest.
+    """A shortest path from keyframes to a position.
 
-    :ivar keyframe_row: row of that keyframe.
-    :ivar points: shape (n, 2), m, from the keyframe to the place; in the frame of the ground.
+    :ivar keyframe_row: row of the nearest keyframe.
+    :ivar points: shape (n, 2), from that keyframe to the position, m, in the frame of the grid.
     """
 
     keyframe_row: int
@@ -45,26 +53,26 @@ class GridPath(NamedTuple):
 
 
 class NavigationGrid:
-    """A grid of what some keyframes show.
+    """Occupancy grid of some keyframes, with the shortest paths from these.
 
-    :ivar free: shape (h, w), where the robot's middle may be.
-    :ivar unknown: shape (h, w), of which nothing is known.
+    :ivar free: shape (h, w), whether the robot's middle may be in a cell.
+    :ivar unknown: shape (h, w), whether a cell is unknown.
     :ivar origin: shape (2,), lower left corner, m.
-    :ivar clearance: shape (h, w), m, from the middles of cells to surfaces.
+    :ivar clearance: shape (h, w), from the middles of cells to surfaces, m.
     """
 
     def __init__(self, scans: Sequence[Scan], poses: Float64, min_clearance: float) -> None:
-        """Draw the grid.
+        """Make the grid.
 
         :param scans: of n keyframes.
-        :param poses: shape (n, 3), theirs in the frame of the ground, m and rad.
-        :param min_clearance: that the robot's middle has to keep from surfaces, m.
+        :param poses: shape (n, 3), theirs in the frame of the grid, m and rad.
+        :param min_clearance: smallest distance of the robot's middle from surfaces, m.
         """
         image = occupancy_image(scans, poses, _CELL, KEYFRAME_RANGE)
         pixels = image.pixels[::-1]
         self.origin, self._min_clearance = image.origin, min_clearance
-        # Single cells between two beams are no frontier.
-        known = ndimage.binary_closing(pixels != UNKNOWN, _AROUND)
+        # Single unknown cells between two beams are closed.
+        known = ndimage.binary_closing(pixels != UNKNOWN, _NEIGHBORS)
         self.unknown: Bool = ~known
         self.clearance: Float64 = _CELL * ndimage.distance_transform_edt(pixels != OCCUPIED)
         self.free: Bool = known & (pixels != OCCUPIED) & (self.clearance >= min_clearance)
@@ -82,48 +90,43 @@ class NavigationGrid:
         )
 
     def cells(self, points: Float64) -> Int64:
-        """Rows and columns (..., 2) of points (..., 2), m; on the grid's border where they are outside."""
+        """Rows and columns (..., 2) of points (..., 2), m; those outside are clipped."""
         found = np.floor((points - self.origin) / _CELL).astype(np.int64)[..., ::-1]
         return np.clip(found, 0, np.array(self.free.shape) - 1)
 
     def is_straight_path_free(self, starts: Float64, ends: Float64) -> Bool:
-        """Whether the robot can go straight from places (n, 2) to others (n, 2), shape (n,)."""
+        """Whether the straight lines between points (n, 2) are free, shape (n,)."""
         longest = float(np.hypot(*(ends - starts).T).max(initial=0.0))
         shares = np.linspace(0.0, 1.0, 2 + int(longest / _CELL))[:, None, None]
         rows, columns = np.moveaxis(self.cells(starts + shares * (ends - starts)), -1, 0)
         return np.asarray(self.free[rows, columns].all(axis=0))
 
     def paths_to_frontiers(self) -> list[GridPath]:
-        """The ways to all frontiers that can be reached from keyframes."""
+        """The paths to all frontiers that are reachable from keyframes."""
         wide = self.clearance >= self._min_clearance + _FRONTIER_CLEARANCE
-        border = wide & (self._numbers >= 0) & ndimage.binary_dilation(self.unknown, _AROUND)
-        groups, count = ndimage.label(border, _AROUND)
-        found = []
-        for group in range(1, count + 1):
-            own = self._numbers[groups == group]
-            own = own[np.isfinite(self._cost[own])]
-            if own.size >= _LEAST:
-                found.append(self._path_to_cell(self._cell_with_most_clearance(own)))
-        return found
+        border = wide & (self._numbers >= 0) & ndimage.binary_dilation(self.unknown, _NEIGHBORS)
+        groups, count = ndimage.label(border, _NEIGHBORS)
+        reachable = [self._reachable_cells(groups == group) for group in range(1, count + 1)]
+        return [self._path_to_widest(cells) for cells in reachable if cells.size >= _MIN_FRONTIER_CELLS]
 
     def paths_to_unvisited_rooms(self, doors: Float64) -> list[GridPath]:
-        """The ways to the parts of the ground behind doors in which no keyframe was taken: to the middle of each.
+        """The paths to the middles of parts of the ground behind doors, without a keyframe in them.
 
         :param doors: shape (n, 4), x and y of both jambs of each, m.
         """
         parts, _ = ndimage.label(self.free & ~self._cells_on_lines(doors))
         parts[np.isin(parts, parts[self._keyframe_cells])] = 0
         numbers, sizes = np.unique(parts[parts > 0], return_counts=True)
-        found = []
-        for part in numbers[sizes * _CELL**2 >= _PART]:
-            own = self._numbers[parts == part]
-            own = own[np.isfinite(self._cost[own])]
-            if own.size:
-                found.append(self._path_to_cell(self._cell_with_most_clearance(own)))
-        return found
+        reachable = [self._reachable_cells(parts == part) for part in numbers[sizes * _CELL**2 >= _MIN_ROOM_SIZE]]
+        return [self._path_to_widest(cells) for cells in reachable if cells.size]
+
+    def _reachable_cells(self, mask: Bool) -> Int64:
+        """Numbers of the cells of a mask (h, w) to which a path leads."""
+        numbers = self._numbers[mask]
+        return np.asarray(numbers[np.isfinite(self._cost[numbers])])
 
     def _cells_on_lines(self, lines: Float64) -> Bool:
-        """The cells that straight lines (n, 4), m, pass."""
+        """Whether cells are on any of some straight lines (n, 4), m, shape (h, w)."""
         passed = np.zeros_like(self.free)
         longest = float(np.hypot(*(lines[:, 2:] - lines[:, :2]).T).max(initial=0.0))
         shares = np.linspace(0.0, 1.0, 2 + int(2.0 * longest / _CELL))[:, None, None]
@@ -131,31 +134,31 @@ class NavigationGrid:
         passed[rows, columns] = True
         return passed
 
-    def _cell_with_most_clearance(self, cells: Int64) -> int:
-        """Of some cells by their numbers the one that is the farthest from surfaces; of equals the first."""
-        away = self.clearance[self._passable_cells[cells, 0], self._passable_cells[cells, 1]]
-        return int(cells[np.argmax(away)])
+    def _path_to_widest(self, cells: Int64) -> GridPath:
+        """The path to the first of the cells with the largest clearance, by their numbers."""
+        clearances = self.clearance[self._passable_cells[cells, 0], self._passable_cells[cells, 1]]
+        return self._path_to_cell(int(cells[np.argmax(clearances)]))
 
-    def path_to(self, place: Float64) -> GridPath | None:
-        """The way to a place (2,), m, or to the nearest beside it; None where none leads there."""
-        away = np.hypot(*(self._cell_centers(self._passable_cells) - place).T)
-        away[~np.isfinite(self._cost)] = np.inf
-        nearest = int(np.argmin(away))
-        return self._path_to_cell(nearest) if away[nearest] <= _ASIDE else None
+    def path_to(self, position: Float64) -> GridPath | None:
+        """The path to a position (2,), m, or to the nearest reachable one; None for none near it."""
+        distances = np.hypot(*(self._cell_centers(self._passable_cells) - position).T)
+        distances[~np.isfinite(self._cost)] = np.inf
+        nearest = int(np.argmin(distances))
+        return self._path_to_cell(nearest) if distances[nearest] <= _MAX_DETOUR else None
 
     def _path_to_cell(self, end: int) -> GridPath:
-        """The way to a cell by its number."""
-        way = [end]
-        while self._predecessors[way[-1]] >= 0:
-            way.append(int(self._predecessors[way[-1]]))
-        return GridPath(self._owners[int(self._source[end])], self._cell_centers(self._passable_cells[way[::-1]]))
+        """The path to a cell by its number."""
+        path = [end]
+        while self._predecessors[path[-1]] >= 0:
+            path.append(int(self._predecessors[path[-1]]))
+        return GridPath(self._owners[int(self._source[end])], self._cell_centers(self._passable_cells[path[::-1]]))
 
     def _cell_centers(self, cells: Int64) -> Float64:
         """The middles of cells (n, 2), m."""
         return self.origin + _CELL * (cells[:, ::-1] + 0.5)
 
     def _step_costs(self, passable: Bool) -> coo_array:
-        """What steps between cells cost, in cells."""
+        """Costs of the steps between cells, in cells."""
         numbers = self._numbers
         price = 1.0 + _INFLATION_COST * np.clip(
             (self._min_clearance + _INFLATION_DISTANCE - self.clearance) / _INFLATION_DISTANCE, 0.0, 1.0

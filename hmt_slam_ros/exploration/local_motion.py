@@ -1,14 +1,13 @@
-"""Local motion: obstacle avoidance with the dynamic window, along a short path around what a scan shows.
+"""Local motion: obstacle avoidance with the dynamic window, along a short path around the surfaces of a scan.
 
-What is out of the laser's field is taken to be free, but costs more. Each cell costs the more the nearer it is to a
-surface, so that a path keeps to the middle of a door. As in Brock and Khatib (1999), High-speed navigation using the
-global dynamic window approach, this is what keeps the dynamic window out of dead ends.
+1. A shortest path to the goal is searched in a grid of the scan (`local_goal`). Cells cost more near surfaces, so that
+   paths pass the middle of doors, and outside the field of view. This keeps the dynamic window out of dead ends, as in
+   Brock and Khatib (1999), High-speed navigation using the global dynamic window approach.
+2. Of the velocities within reach until the next command, those are admissible from which the robot can stop before a
+   contact. The best of these by heading, clearance and progress is taken, as in Fox, Burgard and Thrun (1997), The
+   dynamic window approach to collision avoidance.
 
-Fox, Burgard and Thrun (1997), The dynamic window approach to collision avoidance. Of the velocities that can be reached
-until the next command, those are admissible from which the robot can stop before it touches anything; of these the one
-is taken that turns best towards the goal, is fast, and has far to go. The goal is what `local_goal` finds.
-
-The path is searched by a kernel that ends at the goal: a graph for scipy, new with every scan, takes twice its time.
+The search is a kernel: a new scipy graph for every scan takes twice its time.
 """
 
 from __future__ import annotations
@@ -26,30 +25,55 @@ from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.geometry.se2 import exp_shift
 from hmt_slam_ros.sensors import Scan
 
-_CELL = 0.1  # m
-_HALF = 40  # cells from the robot's to the grid's border
+_CELL = 0.1
+"""Side of a cell, m."""
+
+_HALF = 40
+"""Cells from the robot to the border of the grid."""
+
 _SIDE = 2 * _HALF + 1
-_INFLATION_DISTANCE, _INFLATION_COST = (
-    0.35,
-    4.0,
-)  # m beyond the radius, within which a cell costs up to so many times more
-_UNSEEN_COST = 2.0  # what a cell costs more that is out of the laser's field
-_REMAINING_COST = 2.0  # what a metre that is left to the goal counts, where the goal is not reached
-_LINE_CLEARANCE = 0.2  # m beyond the radius, what a straight line keeps away
-_AHEAD = 0.7  # m, along the path, at least
+
+_INFLATION_DISTANCE, _INFLATION_COST = 0.35, 4.0
+"""Distance beyond the radius up to which a cell costs more, m, and its additional cost at a surface, in cells."""
+
+_UNSEEN_COST = 2.0
+"""Additional cost of a cell outside the field of view, in cells."""
+
+_REMAINING_COST = 2.0
+"""Cost of the remaining distance to a goal that is not reached, per m."""
+
+_LINE_CLEARANCE = 0.2
+"""Clearance of a straight line beyond the radius, m."""
+
+_MIN_LOOKAHEAD = 0.7
+"""Smallest distance of the local goal along the path, m."""
+
+_SPEEDS, _TURN_RATES = 9, 21
+"""Numbers of speeds and turn rates that are evaluated."""
+
+_HEADING, _CLEARANCE, _PROGRESS = 0.8, 0.1, 1.0
+"""Weights of the objective (Fox et al.: alpha, beta and gamma); the last per m."""
+
+_SIMULATION_TIME = 0.6
+"""Time after which heading and progress are evaluated, s."""
+
+_MAX_FREE_DISTANCE = 1.5
+"""Distance beyond which obstacles are ignored, m."""
+
+_STRAIGHT = 1e-4
+"""Turn rates below this are 0, rad/s."""
 
 
 def local_goal(points: Float64, goal: Float64, radius: float, field: float = math.pi) -> Float64:
-    """Where to look on the shortest free path to a goal, or on that to the best place on the way there.
+    """The point to drive to, on the shortest free path to a goal, or to the best reachable cell.
 
-    It is the farthest place on the path to which the straight line is well clear of surfaces, and at least 0.7 m along
-    the path.
+    It is the farthest point on the path with a straight line well clear of surfaces, at least 0.7 m along the path.
 
-    :param points: shape (n, 2), where surfaces are seen, m, the robot's frame.
+    :param points: shape (n, 2), end points of beams, m, the robot's frame.
     :param goal: shape (2,), m, the robot's frame; it may be beyond the grid, which reaches 4 m.
-    :param radius: that the middle of the robot has to keep off, m.
-    :param field: largest bearing at which surfaces are seen, rad.
-    :returns: shape (2,), m; the robot's own place where there is no better one.
+    :param radius: smallest distance of the robot's middle from surfaces, m.
+    :param field: largest bearing of beams, rad.
+    :returns: shape (2,), m; the robot's own position where no other is better.
     """
     return _local_goal(np.ascontiguousarray(points), np.asarray(goal, dtype=np.float64), radius, field)
 
@@ -67,7 +91,7 @@ def _local_goal(points: Float64, goal: Float64, radius: float, field: float) -> 
     chosen, length = path[0], 0.0
     for k in range(1, len(path)):
         length += _cell_distance(path[k - 1], path[k])
-        if length <= _AHEAD or _clearance_on_line(away, path[k]) >= radius + _LINE_CLEARANCE:
+        if length <= _MIN_LOOKAHEAD or _clearance_on_line(away, path[k]) >= radius + _LINE_CLEARANCE:
             chosen = path[k]
     if chosen == last:
         return goal.copy()
@@ -76,7 +100,7 @@ def _local_goal(points: Float64, goal: Float64, radius: float, field: float) -> 
 
 @njit(cache=True)
 def _clearance_on_line(away: Float64, cell: int) -> float:
-    """The smallest distance from surfaces on the straight line from the robot to a cell, m."""
+    """Smallest distance between surfaces and the straight line from the robot to a cell, m."""
     columns, rows = cell % _SIDE - _HALF, cell // _SIDE - _HALF
     steps, nearest = max(abs(columns), abs(rows)), math.inf
     for k in range(steps + 1):
@@ -122,7 +146,7 @@ def _search_path(away: Float64, goal: Float64, radius: float, field: float, last
         for row in range(max(0, cell // _SIDE - 1), min(_SIDE, cell // _SIDE + 2)):
             for column in range(max(0, cell % _SIDE - 1), min(_SIDE, cell % _SIDE + 2)):
                 other = row * _SIDE + column
-                # Out of what is too near it may go away from the surfaces.
+                # From a cell too near to a surface, steps away from it are allowed.
                 if away[other] < radius and (away[cell] >= radius or away[other] <= away[cell]):
                     continue
                 price = 1.0 + _INFLATION_COST * min(
@@ -139,27 +163,20 @@ def _search_path(away: Float64, goal: Float64, radius: float, field: float, last
 
 @njit(cache=True)
 def _cell_distance(cell: int, other: int) -> float:
-    """From one cell to another, m."""
+    """Distance between two cells, m."""
     return _CELL * math.hypot(cell % _SIDE - other % _SIDE, cell // _SIDE - other // _SIDE)
-
-
-_SPEEDS, _TURN_RATES = 9, 21  # velocities that are tried
-_HEADING, _CLEARANCE, _PROGRESS = 0.8, 0.1, 1.0  # alpha, beta and gamma of the objective; the last per m
-_SIMULATION_TIME = 0.6  # s, after which the heading and the progress of velocities are compared
-_MAX_FREE_DISTANCE = 1.5  # m, beyond which nothing in the way counts
-_STRAIGHT = 1e-4  # rad/s
 
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """What a robot can do, and how near it may come.
+    """Limits of a robot's motion.
 
     :ivar speed: at most, m/s.
     :ivar turn_rate: at most, rad/s.
-    :ivar acceleration: m/s^2, to brake as well.
+    :ivar acceleration: also for braking, m/s^2.
     :ivar turn_acceleration: rad/s^2.
     :ivar radius: of its body, m.
-    :ivar margin: that it keeps beyond that, m.
+    :ivar margin: distance from surfaces beyond the radius, m.
     :ivar period: from one command to the next, s.
     :ivar tolerance: distance from the goal at which it has arrived, m.
     """
@@ -175,11 +192,11 @@ class MotionLimits:
 
 
 class MotionCommand(NamedTuple):
-    """What to do until the next scan.
+    """Command until the next scan.
 
     :ivar speed: m/s, never backwards.
     :ivar turn_rate: rad/s.
-    :ivar arrived: whether the goal is reached, and the robot is to stand.
+    :ivar arrived: whether the goal is reached, and the robot stands.
     """
 
     speed: float
@@ -190,11 +207,11 @@ class MotionCommand(NamedTuple):
 def command_towards(
     scan: Scan, goal: NDArray[np.float64], velocity: tuple[float, float], limits: MotionLimits
 ) -> MotionCommand:
-    """The velocities with which to drive towards a goal around what the newest scan shows.
+    """The velocities towards a goal around the surfaces of a scan.
 
-    It does not see behind what hides the rest, and remembers nothing: goals are to be in sight, or nearly.
+    Hidden surfaces are unknown, and nothing is remembered. So goals should be visible, or nearly.
 
-    :param scan: of any field of view; where nothing is seen the way is taken to be free.
+    :param scan: of any field of view; directions without a return are taken to be free.
     :param goal: shape (2,), m, the robot's frame.
     :param velocity: of the robot now, m/s and rad/s.
     """
@@ -209,7 +226,7 @@ def command_towards(
 
 
 def _field_of_view(scan: Scan) -> float:
-    """Largest bearing to both sides of the robot at which a laser sees, rad."""
+    """Largest bearing to both sides of the robot within the field of view, rad."""
     first, last = scan.angle_min, scan.angle_min + scan.angle_increment * (scan.ranges.size - 1)
     gap = abs(scan.angle_increment)
     if abs(last - first) + 1.5 * gap >= 2.0 * math.pi:
@@ -218,13 +235,13 @@ def _field_of_view(scan: Scan) -> float:
     return max(0.0, min(max(first, last) + turn, -min(first, last) - turn)) + gap
 
 
-def _dynamic_window(velocity: tuple[float, float], left: float, limits: MotionLimits) -> NDArray[np.float64]:
-    """Smallest and largest speed and turn rate that can be reached, and from which it can stop at the goal, (2, 2).
+def _dynamic_window(velocity: tuple[float, float], remaining: float, limits: MotionLimits) -> NDArray[np.float64]:
+    """Smallest and largest speed, m/s, and turn rate, rad/s, within reach, with a stop at the goal, (2, 2).
 
-    :param left: to the goal, m.
+    :param remaining: distance to the goal, m.
     """
     change, turn = limits.acceleration * limits.period, limits.turn_acceleration * limits.period
-    fastest = min(limits.speed, math.sqrt(2.0 * limits.acceleration * left))
+    fastest = min(limits.speed, math.sqrt(2.0 * limits.acceleration * remaining))
     low = max(0.0, min(velocity[0], limits.speed) - change)
     slow = max(-limits.turn_rate, min(velocity[1], limits.turn_rate) - turn)
     quick = min(limits.turn_rate, max(velocity[1], -limits.turn_rate) + turn)
@@ -235,7 +252,7 @@ def _dynamic_window(velocity: tuple[float, float], left: float, limits: MotionLi
 def _best_velocity(
     points: Float64, ahead: Float64, window: Float64, radius: float, period: float, brake: float
 ) -> tuple[float, float]:
-    """The admissible velocity that is best; where there is none, braking, and turning towards the goal."""
+    """The best admissible velocity; for none, braking and turning towards the goal."""
     best, speed, turn_rate = -math.inf, window[0, 0], 0.0
     bearing = math.atan2(ahead[1], ahead[0])
     turn_rate = min(max(bearing / period, window[1, 0]), window[1, 1])
@@ -244,7 +261,7 @@ def _best_velocity(
         for k in range(_TURN_RATES):
             omega = window[1, 0] + (window[1, 1] - window[1, 0]) * k / (_TURN_RATES - 1)
             free = _free_distance(points, v, omega, radius)
-            # Until the next command it goes on like this, and then it brakes.
+            # The robot keeps the velocity until the next command, and then brakes.
             if v * period + 0.5 * v * v / brake > free:
                 continue
             facing, nearer = _heading_and_progress(ahead, v, omega)
@@ -256,7 +273,7 @@ def _best_velocity(
 
 @njit(cache=True)
 def _heading_and_progress(ahead: Float64, v: float, omega: float) -> tuple[float, float]:
-    """How well the robot looks towards a point in a while, from 0 to 1 for straight at it; how much nearer it is, m."""
+    """Alignment with a point after the simulation time, 0 to 1 for straight at it, and the decrease of distance, m."""
     heading = omega * _SIMULATION_TIME
     shift_x, shift_y = exp_shift(v * _SIMULATION_TIME, 0.0, heading)
     x, y = ahead[0] - shift_x, ahead[1] - shift_y
@@ -267,7 +284,7 @@ def _heading_and_progress(ahead: Float64, v: float, omega: float) -> tuple[float
 
 @njit(cache=True)
 def _free_distance(points: Float64, v: float, omega: float, radius: float) -> float:
-    """How far a disc goes on an arc before it touches any of the points, m, `_MAX_FREE_DISTANCE` at most."""
+    """Distance of a disc along an arc until it touches a point, m, `_MAX_FREE_DISTANCE` at most."""
     free = _MAX_FREE_DISTANCE
     if v <= 0.0:
         return free
@@ -276,7 +293,7 @@ def _free_distance(points: Float64, v: float, omega: float, radius: float) -> fl
         # Mirrored, so that the arc bends to the left.
         x, y = points[n, 0], side * points[n, 1]
         if x * x + y * y <= radius * radius:
-            # Too near already: away from it, but no nearer.
+            # Too near already: only motion away from the point is free.
             free = 0.0 if x > 0.0 else free
         elif abs(omega) < _STRAIGHT:
             if x > 0.0 and abs(y) < radius:
@@ -288,7 +305,7 @@ def _free_distance(points: Float64, v: float, omega: float, radius: float) -> fl
 
 @njit(cache=True)
 def _distance_along_arc(x: float, y: float, bend: float, radius: float) -> float:
-    """The way along an arc to the left of radius ``bend`` until a disc touches a point, m; inf where it never does."""
+    """Distance along an arc to the left of radius ``bend`` until a disc touches a point, m; inf for never."""
     away = math.hypot(x, bend - y)
     if abs(bend - away) >= radius or away == 0.0:
         return math.inf

@@ -1,9 +1,10 @@
-"""A robot that gets to named places by the belief over places and, behind a door, by the metric filter.
+"""The mission controller: drives a robot to rooms by the belief over places and, behind a door, by the metric filter.
 
-Tomatis, Nourbakhsh and Siegwart (2003), sections 3.3 and 3.4: along hallways the robot keeps to the middle between the
-walls that it sees, and at a node turns as the most likely state policy has it (policy.py). Before the goal's door it
-goes over to the metric filter, but only if it is confident; one that finds no door there goes on along the hallway. Out
-of a room it drives to where the door's node is, and from there on the belief tells again where it is.
+Tomatis, Nourbakhsh and Siegwart (2003), sections 3.3 and 3.4:
+
+1. Along a hallway the robot keeps to its middle. At a node it turns by the most likely state policy (policy.py).
+2. Before the goal's door a confident robot switches to the metric filter. If no door is there, it goes on.
+3. Out of a room it drives to the door's node, and the belief goes on from there.
 """
 
 from __future__ import annotations
@@ -19,12 +20,11 @@ from hmt_slam_ros.exploration.local_motion import MotionCommand, MotionLimits, c
 from hmt_slam_ros.exploration.path_follower import PathFollower
 from hmt_slam_ros.exploration.rooms import Destination, KnownBuilding, RoomFilter
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.heading import QUARTER_TURN
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.places.edge_existence import EdgeMonitor
 from hmt_slam_ros.places.estimator import PlaceEstimator
 from hmt_slam_ros.places.observation import observation_model
-from hmt_slam_ros.places.observation_graph import QUARTERS
+from hmt_slam_ros.places.observation_graph import QUARTER_TURN, QUARTERS
 from hmt_slam_ros.places.place_graph import state_of
 from hmt_slam_ros.places.policy import MetricInitialPose, metric_initial_pose, next_turn, turn_towards
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief
@@ -32,24 +32,45 @@ from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import RelativeMotion
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
-# How far ahead the robot looks along a hallway, m; where it sees so far, m, a hallway leads on.
-_AHEAD, _OPEN = 2.0, 3.0
-# Behind a door the way into a room begins so far from it, m; a place is reached so near to it, m.
-_BEHIND, _AT_PLACE = 0.6, 0.15
-# So long a robot before a door looks for it, and waits where something is in its way, ns. It gets on by so much, m.
-_DOOR_TIMEOUT, _STUCK_TIMEOUT, _PROGRESS = 15 * NANOSECONDS, 10 * NANOSECONDS, 0.3
-# It stands before a door so near to the middle of the hallway, m, and looks along an axis within this angle, rad.
-_MIDDLE, _STRAIGHT = 0.2, math.radians(10.0)
-# It looks along the ways around it where it is so far from where it did last, m, or stands for so long, ns; one that
-# turned back is at its last node again so far before that, m.
-_LOOK, _LOOK_AGAIN, _NODE_MARGIN = 0.5, 5 * NANOSECONDS, 0.2
-# Displacement of a robot that got on.
-_INITIAL_DISPLACEMENT = np.array((_PROGRESS, 0.0, 0.0))
+_LOOKAHEAD = 2.0
+"""Distance of the local goal ahead along a hallway, m."""
+
+_MIN_OPEN_DISTANCE = 3.0
+"""Free distance from which on a hallway goes on, m."""
+
+_DOOR_MARGIN = 0.6
+"""Distance from a door, on both sides, of the points on the path through it, m."""
+
+_PLACE_TOLERANCE = 0.15
+"""Distance at which a place is reached, m."""
+
+_DOOR_TIMEOUT = 15 * NANOSECONDS
+"""Time in which the robot looks for the goal's door, ns."""
+
+_STUCK_TIMEOUT = 10 * NANOSECONDS
+"""Time without progress after which the robot is stuck, ns."""
+
+_MIN_PROGRESS = 0.3
+"""Distance that counts as progress, m."""
+
+_MAX_DISTANCE_TO_MIDDLE = 0.2
+"""Distance from the point before a door at which the robot stands before it, m."""
+
+_MAX_MISALIGNMENT = math.radians(10.0)
+"""Largest angle to the door's axis of a robot that faces it, rad."""
+
+_OBSERVATION_DISTANCE, _OBSERVATION_PERIOD = 0.5, 5 * NANOSECONDS
+"""Distance, m, and time, ns, after which edges are observed again."""
+
+_NODE_MARGIN = 0.2
+"""Distance before its last node at which a robot that turned back is at this node, m."""
+
+_INITIAL_DISPLACEMENT = np.array((_MIN_PROGRESS, 0.0, 0.0))
 _STAND = MotionCommand(0.0, 0.0, arrived=False)
 
 
 class Phase(Enum):
-    """What the robot does."""
+    """Phase of a mission."""
 
     HALLWAY = "goes along a hallway"
     TURN = "turns at a node"
@@ -61,13 +82,13 @@ class Phase(Enum):
 
 
 class MissionController:
-    """Drives a robot.
+    """Drives a robot on missions.
 
-    :ivar estimator: of its place.
-    :ivar phase: what it does.
-    :ivar edge_monitor: which of them are closed.
-    :ivar room: the metric filter, where it is in a room.
-    :ivar initial_pose: what that filter started with last.
+    :ivar estimator: of the robot's place.
+    :ivar phase: of the mission.
+    :ivar edge_monitor: existence of edges.
+    :ivar room: metric filter in a room; None outside.
+    :ivar initial_pose: with which that filter started last.
     """
 
     def __init__(
@@ -76,17 +97,17 @@ class MissionController:
         configuration: Configuration,
         limits: MotionLimits,
         belief: PositionBelief | None = None,
-        ways: EdgeMonitor | None = None,
+        edge_monitor: EdgeMonitor | None = None,
     ) -> None:
         """:param belief: of a robot that begins at a node.
 
-        :param ways: what is known of whether ways are open; nothing unless given.
+        :param edge_monitor: existence of edges; None for certain existence.
         """
         self._building, self._configuration, self._limits = known, configuration, limits
         self._model = observation_model(configuration.places, configuration.features)
         self._mapping = LocalMapping(configuration)
         self.estimator = PlaceEstimator(known.graph, configuration, belief)
-        self.edge_monitor = ways or EdgeMonitor(known.graph, configuration.features)
+        self.edge_monitor = edge_monitor or EdgeMonitor(known.graph, configuration.features)
         self.phase, self._before_door = Phase.THERE, False
         self.room: RoomFilter | None = None
         self.initial_pose: MetricInitialPose | None = None
@@ -95,7 +116,7 @@ class MissionController:
         self._target_axis, self._hallway_axis, self._last_event = 0, 0, (-1, False)
         self._progress_stamp, self._progress = 0, -math.inf
         self._observation_stamp, self._observation_displacement, self._has_turned_back = 0, _INITIAL_DISPLACEMENT, False
-        self._path_follower = PathFollower(limits, _AT_PLACE)
+        self._path_follower = PathFollower(limits, _PLACE_TOLERANCE)
         self._velocity = (0.0, 0.0)
         self._behaviors = {
             Phase.HALLWAY: self._follow_hallway,
@@ -106,24 +127,24 @@ class MissionController:
         }
 
     def start_mission(self, goal: Destination | None) -> None:
-        """Take on a mission.
+        """Start a mission.
 
-        :param goal: None to go on along hallways, to find out where the robot is.
+        :param goal: None for localization along hallways.
         """
         self._goal, self._has_turned_back = goal, False
-        self._path_follower = PathFollower(self._limits, _AT_PLACE)
+        self._path_follower = PathFollower(self._limits, _PLACE_TOLERANCE)
         self._set_turn(0)
         self.phase = Phase.HALLWAY
         if self.room is not None:
             self.phase = Phase.ROOM if goal is self._entered_destination else Phase.LEAVING
 
     def restart_in_hallway(self, belief: PositionBelief) -> None:
-        """The robot is not before the door where its belief had it: it goes on along the hallway by another one."""
+        """Leave the metric filter, and continue along the hallway with another belief: the door was a wrong one."""
         assert self.room is not None
         self.room.release()
         self.room = self._entered_destination = None
         self.estimator.belief = belief
-        # Its axis was the door's, along which one may see as far as along a hallway.
+        # The axis was that of the door, through which the free distance may be as long as in a hallway.
         self._target_axis, self.phase, self._progress = self._target_axis + 1, Phase.TURN, -math.inf
 
     def stop(self) -> None:
@@ -131,7 +152,7 @@ class MissionController:
         self.phase = Phase.THERE
 
     def predict(self, step: RelativeMotion) -> None:
-        """The robot moved."""
+        """Move the robot."""
         self.estimator.predict(step)
         self._observation_displacement = se2.compose(self._observation_displacement, step.increment)
         if self.room is not None:
@@ -144,17 +165,16 @@ class MissionController:
             self._observe_edges(scan.stamp)
         else:
             self.room.observe(scan)
-        drive = self._behaviors.get(self.phase)
-        command = _STAND if drive is None else drive(scan)
+        behavior = self._behaviors.get(self.phase)
+        command = _STAND if behavior is None else behavior(scan)
         self._velocity = command.speed, command.turn_rate
         return command
 
     def _observe_edges(self, stamp: int) -> None:
-        """See which ways are open around a robot that knows where it is."""
-        estimator = self.estimator
-        belief = estimator.belief
-        state = belief.most_likely_state if belief is not None and belief.is_confident else None
-        due = math.hypot(*self._observation_displacement[:2]) >= _LOOK or stamp - self._observation_stamp >= _LOOK_AGAIN
+        """Observe the edges around a confident robot."""
+        estimator, state = self.estimator, self._confident_state
+        moved = math.hypot(*self._observation_displacement[:2]) >= _OBSERVATION_DISTANCE
+        due = moved or stamp - self._observation_stamp >= _OBSERVATION_PERIOD
         if state is None or not due or estimator.is_turning:
             return
         self._observation_stamp, self._observation_displacement = stamp, np.zeros(3)
@@ -162,131 +182,133 @@ class MissionController:
         clear = np.array([frame.free_distance(quarter) for quarter in range(QUARTERS)])
         self.edge_monitor.observe(state, frame.distance_past_node, frame.lateral_offset, clear)
 
-    def _command_towards(self, scan: Scan, place: Float64) -> MotionCommand:
-        return command_towards(scan, place, self._velocity, self._limits)
+    @property
+    def _is_confident(self) -> bool:
+        """Whether the belief over places is confident."""
+        belief = self.estimator.belief
+        return belief is not None and belief.is_confident
+
+    @property
+    def _confident_state(self) -> int | None:
+        """The most likely state of a confident belief; None for another one, and in unknown ground."""
+        belief = self.estimator.belief
+        return belief.most_likely_state if belief is not None and belief.is_confident else None
+
+    def _command_towards(self, scan: Scan, point: Float64) -> MotionCommand:
+        return command_towards(scan, point, self._velocity, self._limits)
 
     def _follow_hallway(self, scan: Scan) -> MotionCommand:
-        """Keep to the middle of the hallway; at a node do what is best there.
+        """Keep to the middle of the hallway, and decide at nodes.
 
-        A robot that was turned off its way by what stood in it turns back, unless it came to a node thereby.
+        A robot that an obstacle turned off its axis turns back, unless it arrived at a node.
         """
-        here = self.estimator.arrivals, self.estimator.is_at_wall
-        arrived = here[0] != self._last_event[0]
+        event = self.estimator.arrivals, self.estimator.is_at_wall
+        arrived = event[0] != self._last_event[0]
         if (self.estimator.frame.travel_axis - self._target_axis) % QUARTERS and not arrived:
             self.phase = Phase.TURN
             return self._turn_at_node(scan)
         self._target_axis = self.estimator.frame.travel_axis
-        if (
-            arrived
-            or here[1] > self._last_event[1]
-            or (self._has_turned_back and self.estimator.frame.distance_past_node >= -_NODE_MARGIN)
-        ):
+        returned = self._has_turned_back and self.estimator.frame.distance_past_node >= -_NODE_MARGIN
+        if arrived or event[1] > self._last_event[1] or returned:
             self._decide(scan)
-        self._last_event = here
+        self._last_event = event
         if self.phase is not Phase.HALLWAY:
             return self._behaviors[self.phase](scan)
         if self._is_stuck(scan):
             self._escape()
         elif self._is_way_closed():
             self._turn_back()
-        return self._command_towards(scan, self.estimator.frame.center_point_ahead_in_base(_AHEAD))
+        return self._command_towards(scan, self.estimator.frame.center_point_ahead_in_base(_LOOKAHEAD))
 
     def _is_way_closed(self) -> bool:
-        """Whether its way was seen to be closed, and there is another one."""
-        belief, goal, closed = self.estimator.belief, self._goal, self.edge_monitor.closed_states
-        state = belief.most_likely_state if belief is not None and belief.is_confident else None
+        """Whether the robot's edge is closed, and another path leads to the goal."""
+        goal, closed, state = self._goal, self.edge_monitor.closed_states, self._confident_state
         if goal is None or state not in closed or self.estimator.frame.distance_past_node < 0.0:
             return False
         return bool(turn_towards(self._building.graph, state, goal.node, closed))
 
     def _turn_back(self) -> None:
-        """Turn between two nodes; at the last one it is decided anew."""
+        """Turn between two nodes, and decide again at the last one."""
         self._set_turn(2)
         self.phase, self._has_turned_back = Phase.TURN, self.estimator.belief is not None
 
     def _escape(self) -> None:
-        """Turn back where the way does not lead on; a robot that does not know its place turns to where it sees far.
+        """Turn back if the hallway is blocked; a robot that is not confident turns to the longest free distance.
 
-        Before the wall opposite a door the way back is the room, out of which it came.
+        That avoids the way back into a room, before the wall opposite its door.
         """
-        belief = self.estimator.belief
-        if belief is not None and belief.is_confident:
+        if self._is_confident:
             self._turn_back()
         else:
             self._set_turn(self._freest_quarter(0))
             self.phase = Phase.TURN
 
     def _is_stuck(self, scan: Scan) -> bool:
-        """Whether the robot has not come farther along its axis for long, wherever it drove meanwhile."""
-        came = self.estimator.frame.coordinate_along(self._target_axis)
-        held_up = came < self._progress + _PROGRESS and scan.stamp - self._progress_stamp > _STUCK_TIMEOUT
-        if held_up or came >= self._progress + _PROGRESS:
-            self._progress, self._progress_stamp = came, scan.stamp
-        return held_up
+        """Whether the robot made no progress along its axis within the timeout."""
+        position = self.estimator.frame.coordinate_along(self._target_axis)
+        progressed = position >= self._progress + _MIN_PROGRESS
+        stuck = not progressed and scan.stamp - self._progress_stamp > _STUCK_TIMEOUT
+        if stuck or progressed:
+            self._progress, self._progress_stamp = position, scan.stamp
+        return stuck
 
     def _decide(self, scan: Scan) -> None:
-        """What the most likely state policy says; straight on where it says nothing, and back at a wall."""
+        """Follow the most likely state policy; without its answer go straight on, or back at a wall."""
         belief, facing, goal = self.estimator.belief, self.estimator.node_and_direction, self._goal
         node = None if goal is None else goal.node
         at_wall, self._has_turned_back = self.estimator.is_at_wall, False
-        if at_wall and belief is not None and belief.is_confident and not self.estimator.is_at_node:
+        if at_wall and self._is_confident and not self.estimator.is_at_node:
             self._turn_back()
             return
-        if goal is not None and belief is not None and belief.is_confident and facing is not None and facing[0] == node:
+        if goal is not None and self._is_confident and facing is not None and facing[0] == node:
             self._hallway_axis = self.estimator.frame.travel_axis
             self._start_door_approach(goal.opening.direction - facing[1], scan)
             return
         closed = self.edge_monitor.closed_states
         quarters = None if belief is None else next_turn(belief, node, self._model, ahead=not at_wall, closed=closed)
         quarters = 2 if at_wall and not quarters else quarters
-        if quarters and not (belief is not None and belief.is_confident) and not self._is_open(quarters):
+        if quarters and not self._is_confident and not self._is_open(quarters):
             quarters = self._freest_quarter(quarters)
         if quarters:
             self._set_turn(quarters)
             self.phase = Phase.TURN
 
     def _is_open(self, quarters: int) -> bool:
-        """Whether the robot sees that it goes on so many quarters to the right."""
-        return not self.estimator.frame.free_distance(quarters) < _OPEN
+        """Whether the free distance some quarters to the right is that of a hallway, or unknown."""
+        return not self.estimator.frame.free_distance(quarters) < _MIN_OPEN_DISTANCE
 
     def _freest_quarter(self, without: int) -> int:
-        """In how many quarters to the right one sees farthest, but for some."""
+        """The quarters to the right with the longest free distance, except for one direction."""
         others = [k for k in range(QUARTERS) if (k - without) % QUARTERS]
         return max(others, key=lambda k: np.nan_to_num(self.estimator.frame.free_distance(k)))
 
     def _set_turn(self, quarters: int) -> None:
-        """Turn so many quarters to the right."""
+        """Set the axis some quarters to the right as target."""
         self._target_axis, self._progress = self.estimator.frame.travel_axis - quarters, -math.inf
 
     def _start_door_approach(self, quarters: int, scan: Scan) -> None:
-        """Turn so many quarters to the right, to where the goal's door is."""
+        """Begin to turn some quarters to the right, to the goal's door."""
         self._set_turn(quarters % QUARTERS)
         self.phase, self._progress_stamp, self._before_door = Phase.DOOR, scan.stamp, False
 
     def _turn_at_node(self, scan: Scan) -> MotionCommand:
-        """Turn at the last node into a hallway; where that does not get anywhere, into another one."""
-        if (
-            self.estimator.frame.travel_axis % QUARTERS == self._target_axis % QUARTERS
-            and not self.estimator.is_turning
-        ):
+        """Turn at the last node into a hallway; if stuck, into another one."""
+        frame = self.estimator.frame
+        if frame.travel_axis % QUARTERS == self._target_axis % QUARTERS and not self.estimator.is_turning:
             self.phase, self._progress = Phase.HALLWAY, -math.inf
         elif self._is_stuck(scan):
-            self._set_turn(self._freest_quarter(self.estimator.frame.travel_axis - self._target_axis))
-        return self._command_towards(scan, self.estimator.frame.node_line_point_in_base(self._target_axis, _AHEAD))
+            self._set_turn(self._freest_quarter(frame.travel_axis - self._target_axis))
+        return self._command_towards(scan, frame.node_line_point_in_base(self._target_axis, _LOOKAHEAD))
 
     def _approach_door(self, scan: Scan) -> MotionCommand:
-        """Turn to the goal's door, and begin with the metric filter there."""
+        """Turn to the goal's door, and start the metric filter there."""
         assert self._goal is not None
-        front, beyond = (
-            self.estimator.frame.node_offset_point_in_base(self._target_axis, far) for far in (0.0, _BEHIND)
-        )
-        off = math.atan2(*(beyond - front)[::-1])
-        self._before_door |= math.hypot(*front) <= _MIDDLE
-        start = (
-            metric_initial_pose(self.estimator, self._building.chart)
-            if self._before_door and abs(off) <= _STRAIGHT
-            else None
-        )
+        frame = self.estimator.frame
+        front, beyond = (frame.node_offset_point_in_base(self._target_axis, offset) for offset in (0.0, _DOOR_MARGIN))
+        angle = math.atan2(*(beyond - front)[::-1])
+        self._before_door |= math.hypot(*front) <= _MAX_DISTANCE_TO_MIDDLE
+        aligned = abs(angle) <= _MAX_MISALIGNMENT
+        start = metric_initial_pose(self.estimator, self._building.chart) if self._before_door and aligned else None
         if start is not None and start.node == self._goal.node:
             return self._enter_room(start, scan)
         if scan.stamp - self._progress_stamp > _DOOR_TIMEOUT:
@@ -294,68 +316,67 @@ class MissionController:
             return self._turn_at_node(scan)
         if not self._before_door:
             return self._command_towards(scan, front)
-        return self._turn_in_place(off) if abs(off) > _STRAIGHT else self._command_towards(scan, beyond)
+        return self._command_towards(scan, beyond) if aligned else self._turn_in_place(angle)
 
     def _enter_room(self, start: MetricInitialPose, scan: Scan) -> MotionCommand:
-        """Go over to the metric filter."""
+        """Switch to the metric filter."""
         self.room = RoomFilter(self._mapping, self._building, start)
         self._entered_destination, self.initial_pose, self.phase = self._goal, start, Phase.ROOM
-        self._path_follower = PathFollower(self._limits, _AT_PLACE)
+        self._path_follower = PathFollower(self._limits, _PLACE_TOLERANCE)
         return self._drive_into_room(scan)
 
     def _turn_in_place(self, angle: float) -> MotionCommand:
-        """Turn on the spot."""
+        """The command for a turn on the spot by an angle, rad."""
         limits = self._limits
         rate = min(limits.turn_rate, math.sqrt(2.0 * limits.turn_acceleration * abs(angle)), abs(angle) / limits.period)
         return MotionCommand(0.0, math.copysign(rate, angle), arrived=False)
 
     def _drive_into_room(self, scan: Scan) -> MotionCommand:
-        """Drive to the place in the room."""
+        """Drive to the destination in the room."""
         goal = self._entered_destination
         assert goal is not None
         door = goal.opening.landmark.pose.mean
-        through = se2.transform(door, np.array([[-_BEHIND, 0.0], [_BEHIND, 0.0]]))
+        through = se2.transform(door, np.array([[-_DOOR_MARGIN, 0.0], [_DOOR_MARGIN, 0.0]]))
         command = self._follow_path(scan, np.concatenate((through, goal.position[None])))
         if self._path_follower.has_arrived:
             self.phase = Phase.THERE
         return command
 
     def _drive_out_of_room(self, scan: Scan) -> MotionCommand:
-        """Drive back to the node before the door, and let the belief go on from there."""
+        """Drive back to the node before the door, and continue by the belief from there."""
         assert self._entered_destination is not None
         assert self.room is not None
         door = self._entered_destination.opening.landmark.pose.mean
-        through = se2.transform(door, np.array([[_BEHIND, 0.0], [-_BEHIND, 0.0]]))
+        through = se2.transform(door, np.array([[_DOOR_MARGIN, 0.0], [-_DOOR_MARGIN, 0.0]]))
         command = self._follow_path(scan, np.concatenate((self._entered_destination.position[None], through)))
         if self._path_follower.has_arrived:
             self._resume_in_hallway(scan)
         return command
 
-    def _follow_path(self, scan: Scan, way: Float64) -> MotionCommand:
+    def _follow_path(self, scan: Scan, path: Float64) -> MotionCommand:
         assert self.room is not None
-        return self._path_follower.steer(scan, se2.transform(se2.inverse(self.room.pose), way), self._velocity)
+        return self._path_follower.steer(scan, se2.transform(se2.inverse(self.room.pose), path), self._velocity)
 
     def _resume_in_hallway(self, scan: Scan) -> None:
-        """Out of a room the robot is at the node before its door; where it looks, the metric filter knows.
+        """Continue at the node before a room's door, with the direction of the metric filter.
 
-        From there the goal is another node's, or it is the room behind another door of this one. The robot has got on,
-        though it may be where it went in.
+        The goal is at another node, or behind another door of this one.
         """
         assert self.room is not None
         assert self._entered_destination is not None
         assert self._goal is not None
         opening = self._entered_destination.opening
         turned = round(float(se2.wrap(self.room.pose[2] - opening.landmark.pose.mean[2])) / QUARTER_TURN)
-        node, looks = self._entered_destination.node, (opening.direction - turned) % QUARTERS
-        state = state_of(node, looks)
+        node, direction = self._entered_destination.node, (opening.direction - turned) % QUARTERS
+        state = state_of(node, direction)
         graph, places = self._building.graph, self._configuration.places
         self.room.release()
         self.room, self._entered_destination = None, None
         self.estimator = PlaceEstimator(graph, self._configuration, certain_belief(graph, places, state))
         self._last_event = 0, False
         if self._goal.node == node:
-            self._hallway_axis = self.estimator.frame.travel_axis - (opening.direction - looks) + 1
-            self._start_door_approach(self._goal.opening.direction - looks, scan)
+            self._hallway_axis = self.estimator.frame.travel_axis - (opening.direction - direction) + 1
+            self._start_door_approach(self._goal.opening.direction - direction, scan)
             return
         quarters = turn_towards(graph, state, self._goal.node, self.edge_monitor.closed_states)
         self._set_turn(quarters or 0)

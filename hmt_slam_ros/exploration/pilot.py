@@ -1,11 +1,11 @@
-"""The pilot: says where the robot is by the belief over places, and gets it to rooms by that.
+"""The pilot: estimates the robot's place, and drives it to rooms by that.
 
-Tomatis, Nourbakhsh and Siegwart (2003), section 3.4: the metric filter starts with what the door tells. RTL tells the
-pose in which metric SLAM has the robot; whether that agrees with the door shows whether either is wrong.
+Tomatis, Nourbakhsh and Siegwart (2003), sections 3.3 and 3.4.
 
-Tomatis, Nourbakhsh and Siegwart (2003), sections 3.3 and 3.4. The belief is followed at every scan, whoever drives. At
-an opening, where it is confident, it tells metric SLAM where the robot is, if that does not know. Behind the door of a
-mission the robot is steered by the metric filter of the room, see rooms.py.
+1. The belief over places is updated at every scan, also where others drive.
+2. At an opening a confident belief gives metric SLAM an initial pose, if that is lost.
+3. Behind the door of a task the metric filter of the room steers the robot (rooms.py).
+4. There the pose of RTL is compared with that by the door, which shows whether either is wrong.
 """
 
 from __future__ import annotations
@@ -23,42 +23,59 @@ from hmt_slam_ros.exploration.rooms import KnownBuilding, named_destinations
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
-from hmt_slam_ros.landmarks.heading import QUARTER_TURN
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message, PoseReset, RealTimePose
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.messages.tasks import GoalPose, PlaceEstimate, Task, TaskResult, VelocityCommand
 from hmt_slam_ros.places.edge_existence import EdgeMonitor
-from hmt_slam_ros.places.observation_graph import QUARTERS
+from hmt_slam_ros.places.observation_graph import QUARTER_TURN, QUARTERS
 from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, state_of
 from hmt_slam_ros.places.policy import MetricInitialPose, metric_initial_pose
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief, uniform_belief
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.sensors.motion_model import NO_MOTION, OdometryBuffer, RelativeMotion, increment_covariance
 
-# Two beliefs over one pose agree with this probability, both known no better than this, m, m, rad.
 _AGREEMENT_GATE = chi_square_gate(0.999)
+"""Gate of the squared Mahalanobis distance between two beliefs over one pose."""
+
 _MIN_COVARIANCE = np.diag([0.1, 0.1, math.radians(3.0)]) ** 2
-# A pose is good for so long, ns.
+"""Covariance that is added to both beliefs, m and rad."""
+
 _MAX_POSE_AGE = NANOSECONDS
+"""Age up to which a pose of RTL is used, ns."""
+
+_MAX_WAITING_SCANS = 50
+"""Scans that wait for odometry, at most."""
+
+_EXIT_DISTANCE = 0.6
+"""Distance before the door at which a robot has left a room, m."""
+
+_STANDING_DISTANCE, _STANDING_ANGLE = 0.01, math.radians(1.0)
+"""Largest motion of a standing robot between two scans, m and rad."""
+
+_RELOCALIZATION_TIMEOUT = 3 * NANOSECONDS
+"""Time for which the robot waits before a door for metric SLAM, ns."""
+
+_TIME_JUMP = NANOSECONDS
+"""Step of the stamps of scans back in time that resets the pilot, ns."""
 
 
 class MetricPoseTracker:
-    """What RTL said last, at the time of the newest scan, and the map that they have by now.
+    """The pose of RTL at the newest scan, in the current map of metric SLAM.
 
-    Where the robot was lost they map on in new areas, and join these to the map as they recognize it.
+    A lost robot maps new areas, which a loop closure joins to the map later.
     """
 
     def __init__(self, replica: Replica) -> None:
-        """:param replica: their map at first."""
+        """:param replica: the initial map."""
         self._replica = replica
         self._readings = OdometryBuffer()
         self._last_pose: RealTimePose | None = None
         self._predicted_pose: PoseGaussian | None = None
 
     def on_message(self, message: Message) -> None:
-        """Take in what is newest."""
+        """Process odometry, a pose, or a message of the chain."""
         if isinstance(message, Odometry):
             self._readings.add(message)
         elif isinstance(message, RealTimePose):
@@ -67,7 +84,7 @@ class MetricPoseTracker:
             self._replica.apply_message(message)
 
     def predict_to(self, stamp: int) -> None:
-        """Carry the pose on to a time, ns, or back to it."""
+        """Move the pose to a time, ns, by odometry."""
         self._predicted_pose = None
         self._readings.pose_at(stamp - _MAX_POSE_AGE)
         newest = self._last_pose
@@ -76,10 +93,10 @@ class MetricPoseTracker:
             self._predicted_pose = newest.pose_in_area.compose(PoseGaussian.from_pose(since))
 
     def pose_in_area(self, area: int) -> PoseGaussian | None:
-        """The belief over ``area_T_base``; None where they do not have the robot in the map.
+        """The belief over ``area_T_base``; None while metric SLAM does not have the robot in the map.
 
-        Metric SLAM lays what is around the robot into the frame of the robot's area as the arcs have it, and matches
-        with that. So the pose relative to what is there is as good as the match, however long the way over the arcs is.
+        Metric SLAM matches with a submap that is assembled by the arcs. So the pose relative to an area is as accurate
+        as the match, for any number of arcs in between.
         """
         hybrid_map = self._replica.maps[self._replica.best_hypothesis]
         if self._predicted_pose is None or self._last_pose is None or not hybrid_map.has_area(area):
@@ -88,37 +105,28 @@ class MetricPoseTracker:
         return None if frame is None else PoseGaussian.from_pose(frame.mean).compose(self._predicted_pose)
 
     def agrees_with(self, area: int, belief: PoseGaussian) -> bool:
-        """Whether they have the robot where another belief over ``area_T_base`` has it."""
-        told = self.pose_in_area(area)
-        if told is None:
+        """Whether another belief over ``area_T_base`` agrees with that of metric SLAM."""
+        pose = self.pose_in_area(area)
+        if pose is None:
             return False
-        off = se2.log(se2.between(belief.mean, told.mean))
-        spread = belief.covariance + told.covariance + _MIN_COVARIANCE
-        return float(off @ np.linalg.solve(spread, off)) <= _AGREEMENT_GATE
-
-
-# Scans that wait for odometry, at most.
-_WAITING = 50
-# So far before the door, m, it is out of a room.
-_EXIT_DISTANCE = 0.6
-# A robot stands that went and turned no more than this since the last scan, m and rad, and waits for so long, ns.
-_STANDING_DISTANCE, _STANDING_ANGLE, _RELOCALIZATION_TIMEOUT = 0.01, math.radians(1.0), 3 * NANOSECONDS
-# A scan that is stamped so much before the one before, ns, says that time went back.
-_TIME_JUMP = NANOSECONDS
+        difference = se2.log(se2.between(belief.mean, pose.mean))
+        covariance = belief.covariance + pose.covariance + _MIN_COVARIANCE
+        return float(difference @ np.linalg.solve(covariance, difference)) <= _AGREEMENT_GATE
 
 
 class PilotProcess:
-    """The pilot as a process. Consumes Task, Odometry, Scan, RealTimePose and the chain; says PoseReset, and what
-    tasks.py has.
+    """The pilot as a process.
 
-    :ivar rooms: {name: the place in it} to which it can be sent.
-    :ivar controller: that drives.
+    Consumes Task, Odometry, Scan, RealTimePose and the chain; produces PoseReset and the messages of tasks.py.
+
+    :ivar rooms: {name: destination} of tasks.
+    :ivar controller: drives the robot.
     """
 
     def __init__(self, configuration: Configuration, saved: ReplicaState) -> None:
-        """:param saved: the map, with which the metric processes begin, too.
+        """:param saved: the initial map, also of metric SLAM.
 
-        :raises HmtSlamError: where no place is in it.
+        :raises HmtSlamError: for a map without places.
         """
         replica = Replica.from_state(saved)
         self._configuration = configuration
@@ -132,10 +140,10 @@ class PilotProcess:
         self._reset()
 
     def _reset(self) -> None:
-        """The robot may be anywhere, at any time."""
+        """Reset pose, place and task."""
         self._reset_controller(None)
         self._readings = OdometryBuffer()
-        self._waiting: deque[Scan] = deque(maxlen=_WAITING)
+        self._waiting: deque[Scan] = deque(maxlen=_MAX_WAITING_SCANS)
         self._stamp, self._odometry = 0, np.zeros(3)
         self._task: Task | None = None
         self._task_start: int | None = None
@@ -150,22 +158,22 @@ class PilotProcess:
         )
 
     def handle(self, message: Message) -> list[Message]:
-        """Take in one message; a scan is answered as soon as odometry of its time is there."""
+        """Process one message; a scan is answered as soon as odometry covers its stamp."""
         if isinstance(message, Task):
             return self._accept_task(message)
-        said: list[Message] = []
+        outputs: list[Message] = []
         self._metric_poses.on_message(message)
         if isinstance(message, Odometry):
             self._readings.add(message)
         elif isinstance(message, Scan):
-            said += self._handle_time_jump(message.stamp)
+            outputs += self._handle_time_jump(message.stamp)
             self._waiting.append(message)
         while self._waiting and self._readings.covers(self._waiting[0].stamp):
-            said += self._process_scan(self._waiting.popleft())
-        return said
+            outputs += self._process_scan(self._waiting.popleft())
+        return outputs
 
     def _accept_task(self, task: Task) -> list[Message]:
-        """Begin a task in place of the one before."""
+        """Begin a task, which replaces the one before."""
         if not self._configuration.pilot.drives:
             return [TaskResult(task, False, "pilot.drives is false, so others drive the robot: set it to true")]
         if task.kind == "go" and task.place not in self.rooms:
@@ -180,7 +188,7 @@ class PilotProcess:
         return [] if goal is None else [GoalPose(self._stamp, goal.opening.area, goal.pose)]
 
     def _stop(self) -> list[Message]:
-        """Let the robot stand, if it is on a task."""
+        """Stop the robot, if it has a task."""
         if self._task is None:
             return []
         self.controller.stop()
@@ -188,16 +196,16 @@ class PilotProcess:
         return [VelocityCommand(self._stamp, 0.0, 0.0)]
 
     def _handle_time_jump(self, stamp: int) -> list[Message]:
-        """Begin anew where time went back."""
+        """Reset the pilot if time went back."""
         if stamp > self._stamp - _TIME_JUMP:
             return []
-        task, stopped = self._task, self._stop()
+        task, commands = self._task, self._stop()
         self._reset()
-        ended = [] if task is None else [TaskResult(task, False, "given up: time went back")]
-        return [*ended, *stopped]
+        results = [] if task is None else [TaskResult(task, False, "given up: time went back")]
+        return [*results, *commands]
 
     def _process_scan(self, scan: Scan) -> list[Message]:
-        """Follow the robot, and drive."""
+        """Update place and pose by a scan, and drive."""
         odometry = self._readings.pose_at(scan.stamp)
         if odometry is None or scan.stamp <= self._stamp:
             return []
@@ -209,17 +217,17 @@ class PilotProcess:
         if self.controller.initial_pose is not before:
             self._begin_room(self.controller.initial_pose)
         self._detect_room_exit()
-        said = [self._place_estimate(), *self._reset_pose_at_opening(), *self._confirm_room_pose()]
+        outputs = [self._place_estimate(), *self._reset_pose_at_opening(), *self._confirm_room_pose()]
         if self._task is None:
-            return said
-        ended = self._task_result(self._task)
-        if ended is not None:
-            return [*said, ended, *self._stop()]
-        stands = self._unconfirmed_pose is not None
-        return [*said, VelocityCommand(scan.stamp, 0.0, 0.0) if stands else VelocityCommand(scan.stamp, *command[:2])]
+            return outputs
+        result = self._task_result(self._task)
+        if result is not None:
+            return [*outputs, result, *self._stop()]
+        velocity = command[:2] if self._unconfirmed_pose is None else (0.0, 0.0)
+        return [*outputs, VelocityCommand(scan.stamp, *velocity)]
 
     def _predict(self, odometry: Float64) -> None:
-        """The robot moved to where odometry has it now, ``odom_T_base`` (3,)."""
+        """Move the robot to an odometry pose, ``odom_T_base`` (3,)."""
         if self._stamp:
             increment = se2.between(self._odometry, odometry)
             self._step = RelativeMotion(increment, increment_covariance(increment, self._configuration.motion))
@@ -227,15 +235,15 @@ class PilotProcess:
         self._odometry = odometry
 
     def _begin_room(self, start: MetricInitialPose | None) -> None:
-        """The metric filter of a room begins."""
+        """Note the start of a room's metric filter."""
         assert self._task is not None
         self._room_name, self._pose_reset_stamp, self._unconfirmed_pose = self._task.place, None, start
 
     def _confirm_room_pose(self) -> list[Message]:
-        """The robot stands before the door until the metric processes have it there, or do not find it.
+        """Let the robot stand before a door until metric SLAM agrees with its pose there, or does not find it.
 
-        They are told where it is if they do not know, and take that for the place of the next scan. Where they have it
-        elsewhere in the map the belief is taken for wrong, since surfaces say more than landmarks.
+        If metric SLAM is lost, it gets this pose. If it has the robot elsewhere in the map, the belief over places is
+        reset, since scans say more than landmarks.
         """
         entered, room = self._unconfirmed_pose, self.controller.room
         if entered is None or room is None:
@@ -254,15 +262,17 @@ class PilotProcess:
         return []
 
     def _reset_pose_at_opening(self) -> list[Message]:
-        """What an opening tells through which a robot looks that others drive, once, unless it is known."""
+        """The initial pose by the opening that a robot without a task faces, once, if metric SLAM is lost."""
         estimator = self.controller.estimator
-        this = estimator.arrivals, estimator.node_and_direction
-        if self._task is not None or self.controller.room is not None or this == self._last_opening or self._is_turning:
+        opening = estimator.arrivals, estimator.node_and_direction
+        if self._task is not None or self.controller.room is not None:
+            return []
+        if opening == self._last_opening or self._is_turning:
             return []
         start = metric_initial_pose(estimator, self._building.chart)
         if start is None:
             return []
-        self._last_opening = this
+        self._last_opening = opening
         known = self._metric_poses.pose_in_area(start.area) is not None
         return [] if known else [PoseReset(InitialPose(start.area, start.pose))]
 
@@ -291,20 +301,20 @@ class PilotProcess:
         )
 
     def _detect_room_exit(self) -> None:
-        """Where somebody drove the robot out of a room it is at the node before the door."""
+        """Continue at the node before the door, if the robot was driven out of a room without a task."""
         room = self.controller.room
         if room is None or self._task is not None:
             return
         node, opening, _ = self.rooms[self._room_name]
-        off = se2.between(opening.landmark.pose.mean, room.pose)
-        if off[0] > -_EXIT_DISTANCE:
+        offset = se2.between(opening.landmark.pose.mean, room.pose)
+        if offset[0] > -_EXIT_DISTANCE:
             return
-        state = state_of(node, (opening.direction - round(off[2] / QUARTER_TURN)) % QUARTERS)
+        state = state_of(node, (opening.direction - round(offset[2] / QUARTER_TURN)) % QUARTERS)
         room.release()
         self._reset_controller(certain_belief(self._building.graph, self._configuration.places, state))
 
     def _is_localized_for(self, task: Task) -> bool:
-        """Whether it is known where the robot is, and that was asked."""
+        """Whether a task to localize is done."""
         estimator = self.controller.estimator
         known = (
             estimator.belief is not None and estimator.belief.is_confident and estimator.node_and_direction is not None
@@ -313,7 +323,7 @@ class PilotProcess:
 
     @property
     def _location_text(self) -> str:
-        """Where it is most probably."""
+        """The most likely place, in words."""
         if self.controller.room is not None:
             return f"in {self._room_name}"
         facing = self.controller.estimator.node_and_direction
@@ -321,7 +331,7 @@ class PilotProcess:
         return f"at {self._building.chart.name(facing[0])}, looking {DIRECTION_NAMES[facing[1]]}"
 
     def _task_result(self, task: Task) -> TaskResult | None:
-        """How a task ended, if it did."""
+        """The result of a task; None if it goes on."""
         if self._task_start is None:
             self._task_start = self._stamp
         if self._is_localized_for(task):

@@ -1,9 +1,8 @@
-"""What of a building is known, on top of its HMT map: a roadmap of keyframes, and what is open beside them.
+"""Roadmap of keyframes over an HMT map, with the frontiers and rooms beside them.
 
-Tomatis, Nourbakhsh and Siegwart (2003), section 3.1: thin and long open spaces are hallways, others are rooms.
-
-Where a keyframe was taken the robot has been, so it can get there again. The roadmap joins keyframes between which it
-can go straight. Both are kept up to date around the robot's area alone; what is farther away stays as it was seen.
+The robot can return to the pose of any keyframe. The roadmap joins keyframes between which a straight line is free.
+Roadmap and frontiers are updated around the robot alone. Hallways and rooms are told apart as in Tomatis, Nourbakhsh
+and Siegwart (2003), section 3.1.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import Neighborhood, areas_around
 from hmt_slam_ros.landmarks.area_classes import hallway_log_odds, measure_free_space
-from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
 from hmt_slam_ros.landmarks.openings import distance_to_doors, extract_openings, jamb_positions
+from hmt_slam_ros.landmarks.rays import rays_from_scan
 from hmt_slam_ros.sensors import Scan
 
 
 class PlaceClassification(NamedTuple):
-    """What a scan shows.
+    """Class and doors of the place of a scan.
 
-    :ivar is_hallway: whether the robot is in a hallway; one that sees too little of what is around it is not.
+    :ivar is_hallway: whether the robot is in a hallway; False where too little is visible.
     :ivar doors: shape (n, 4), x and y of both jambs of each door, m, in the frame of the base.
     """
 
@@ -42,9 +41,9 @@ class PlaceClassification(NamedTuple):
 
 
 def classify_place(scan: Scan, features: FeatureParameters, max_door_width: float) -> PlaceClassification:
-    """What a scan shows.
+    """Class and doors of the place of a scan.
 
-    :param max_door_width: an opening up to so wide is a door, a wider one a hallway, m.
+    :param max_door_width: largest width of a door; wider openings lead to hallways, m.
     """
     rays = rays_from_scan(scan, features)
     openings = extract_openings(extract_lines(scan, features), rays, features)
@@ -56,7 +55,7 @@ def classify_place(scan: Scan, features: FeatureParameters, max_door_width: floa
 
 
 def crosses_doors(ways: Float64, doors: Float64) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which of some straight ways pass any of the doors.
+    """Whether straight lines cross any of the doors.
 
     :param ways: shape (n, 4), x and y of both ends, m.
     :param doors: shape (m, 4), likewise, in the same frame.
@@ -70,32 +69,40 @@ def crosses_doors(ways: Float64, doors: Float64) -> np.ndarray[tuple[int], np.dt
 
 
 def _side(a: Float64, b: Float64, p: Float64) -> Float64:
-    """Above 0 where p is to the left of the line from a to b."""
-    along, to = b - a, p - a
-    return np.asarray(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
+    """Positive where p is to the left of the line from a to b."""
+    along, offset = b - a, p - a
+    return np.asarray(along[..., 0] * offset[..., 1] - along[..., 1] * offset[..., 0])
 
 
-# How certain the place of an area has to be for its scans to be laid over those of the robot's area, m.
 _MAX_AREA_DEVIATION = 1.0
-# What is up to this distance from the robot is found anew, by all that keyframes up to that distance show, m.
+"""Largest deviation of the position of an area whose scans are used, m."""
+
 _UPDATE_RADIUS = 8.0
+"""Distance from the robot up to which roadmap and frontiers are updated, m."""
+
 _SCAN_RADIUS = _UPDATE_RADIUS + KEYFRAME_RANGE
-# Keyframes of the roadmap are joined up to this distance, m; from one to the next the robot drove up to this one.
-_MAX_EDGE_LENGTH, _MAX_DRIVEN_STEP = 8.0, 1.5
-# Keyframes that are so near to one, m, may stand for it.
+"""Distance from the robot up to which keyframes are used for that, m."""
+
+_MAX_EDGE_LENGTH = 8.0
+"""Longest edge of the roadmap, m."""
+
+_MAX_DRIVEN_STEP = 1.5
+"""Largest distance between consecutive keyframes that the robot drove between, m."""
+
 _BESIDE = 1.5
-# Where fewer keyframes are in a segment, there is no room.
+"""Largest distance of keyframes that may replace each other, m."""
+
 _MIN_ROOM_KEYFRAMES = 3
+"""Keyframes in an entered room, at least."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frontier:
-    """Where known ground ends, or a room that nobody entered.
+    """The end of known ground, or an unvisited room.
 
-    :ivar keyframe: from which the way there is shortest.
-    :ivar path: shape (n, 2), from there to a place at the frontier or in the room's middle, m, in the frame of the
-        keyframe's base.
-    :ivar is_in_hallway: whether it is expected to be in a hallway; else it is in a room.
+    :ivar keyframe: the nearest on the path there.
+    :ivar path: shape (n, 2), from there to the frontier or the room's middle, m, in the frame of the keyframe's base.
+    :ivar is_in_hallway: whether it is expected in a hallway; else in a room.
     """
 
     keyframe: int
@@ -104,15 +111,15 @@ class Frontier:
 
     @property
     def length(self) -> float:
-        """Of the way, m."""
+        """Length of the path, m."""
         return float(np.hypot(*np.diff(self.path, axis=0).T).sum())
 
 
 class EntryPoint(NamedTuple):
-    """How the robot gets to the roadmap.
+    """The robot's path to the roadmap.
 
     :ivar keyframe: the nearest.
-    :ivar path: shape (n, 2), from beside the robot to there, m, in the frame of the keyframe's base.
+    :ivar path: shape (n, 2), from the robot to there, m, in the frame of the keyframe's base.
     """
 
     keyframe: int
@@ -122,28 +129,28 @@ class EntryPoint(NamedTuple):
 class Roadmap:
     """Roadmap and frontiers.
 
-    :ivar graph: its nodes are keyframes, its edges have a ``length``, m, and whether a ``door`` is passed.
-    :ivar frontiers: all that are known.
+    :ivar graph: of keyframes; edges have a ``length``, m, and whether they cross a ``door``.
+    :ivar frontiers: known ones.
     """
 
     def __init__(self, features: FeatureParameters, min_clearance: float, max_door_width: float) -> None:
-        """:param min_clearance: that the robot's middle keeps from surfaces, m.
+        """:param min_clearance: smallest distance of the robot's middle from surfaces, m.
 
-        :param max_door_width: an opening up to so wide is a door, m.
+        :param max_door_width: largest width of a door, m.
         """
         self._features, self._min_clearance, self._max_door_width = features, min_clearance, max_door_width
         self._classifications: dict[int, PlaceClassification] = {}
         self.graph = nx.Graph()
         self.frontiers: list[Frontier] = []
-        # {keyframe: its area and its pose in that} as of the last look.
+        # {keyframe: its area and its pose in that} at the last update.
         self._keyframe_poses: dict[int, tuple[int, Float64]] = {}
 
     def update(self, hybrid_map: HybridMap, scans: Mapping[int, Scan], area: int, pose: Float64) -> EntryPoint | None:
-        """Bring all around the robot up to date.
+        """Update roadmap and frontiers around the robot.
 
         :param area: the robot's.
-        :param pose: ``area_T_base`` (3,).
-        :returns: how the robot gets to the roadmap, None where nothing is known around it.
+        :param pose: ``area_T_base`` (3,), m and rad.
+        :returns: the robot's path to the roadmap, None without keyframes around it.
         """
         poses = {
             keyframe: placed
@@ -163,26 +170,26 @@ class Roadmap:
         return self._entry_point(names, placed, ground, pose)
 
     def update_everywhere(self, hybrid_map: HybridMap, scans: Mapping[int, Scan]) -> None:
-        """Bring all of a map up to date."""
+        """Update roadmap and frontiers of a whole map."""
         for area in hybrid_map.area_ids():
-            looked: list[Float64] = []
+            updated: list[Float64] = []
             for pose in hybrid_map.keyframes(area).values():
-                if all(math.dist(pose[:2], other[:2]) > 0.5 * _UPDATE_RADIUS for other in looked):
-                    looked.append(pose)
+                if all(math.dist(pose[:2], other[:2]) > 0.5 * _UPDATE_RADIUS for other in updated):
+                    updated.append(pose)
                     self.update(hybrid_map, scans, area, pose)
 
     def _entry_point(self, names: list[int], placed: Float64, ground: NavigationGrid, pose: Float64) -> EntryPoint:
-        """How the robot gets to the roadmap; straight to the nearest keyframe where no other way is seen."""
-        way = ground.path_to(pose[:2])
-        if way is not None:
-            row, points = way.keyframe_row, way.points[::-1]
+        """The robot's path to the roadmap; straight to the nearest keyframe where the grid has none."""
+        path = ground.path_to(pose[:2])
+        if path is not None:
+            row, points = path.keyframe_row, path.points[::-1]
         else:
-            away = np.hypot(*(placed[:, :2] - pose[:2]).T)
-            row, points = int(np.argmin(away)), placed[:0, :2]
+            distances = np.hypot(*(placed[:, :2] - pose[:2]).T)
+            row, points = int(np.argmin(distances)), placed[:0, :2]
         return EntryPoint(names[row], se2.transform(se2.inverse(placed[row]), points))
 
     def _remove_outdated(self, hybrid_map: HybridMap, poses: Mapping[int, Float64], pose: Float64) -> None:
-        """Forget what is no more, and what is near to the robot and will be found anew.
+        """Remove keyframes that are not in the map, and edges and frontiers near the robot, which are found again.
 
         :param poses: {keyframe: pose (3,)} around the robot.
         """
@@ -190,30 +197,35 @@ class Roadmap:
         self.graph.remove_nodes_from([keyframe for keyframe in self.graph if keyframe not in known])
         near = {keyframe for keyframe, placed in poses.items() if _is_near(placed, pose)}
         self.graph.remove_edges_from([edge for edge in self.graph.edges if edge[0] in near and edge[1] in near])
+        reattached = [self._reattach_frontier(frontier, known) for frontier in self.frontiers]
         self.frontiers = [
-            one
-            for one in (self._reattach_frontier(one, known) for one in self.frontiers)
-            if one is not None
-            and not (one.keyframe in poses and _is_near(se2.transform(poses[one.keyframe], one.path[-1]), pose))
+            frontier
+            for frontier in reattached
+            if frontier is not None
+            and not (
+                frontier.keyframe in poses
+                and _is_near(se2.transform(poses[frontier.keyframe], frontier.path[-1]), pose)
+            )
         ]
         self._keyframe_poses = known
 
-    def _reattach_frontier(self, one: Frontier, known: Mapping[int, tuple[int, Float64]]) -> Frontier | None:
-        """What is open, as seen from another keyframe of the same area where its own is no more.
+    def _reattach_frontier(self, frontier: Frontier, known: Mapping[int, tuple[int, Float64]]) -> Frontier | None:
+        """The frontier, if its keyframe was removed from another keyframe of the same area; None for none.
 
         :param known: {keyframe: its area and its pose in that}.
         """
-        if one.keyframe in known:
-            return one
-        area, pose = self._keyframe_poses[one.keyframe]
-        left = {k: own for k, (other, own) in self._keyframe_poses.items() if other == area and k in known}
-        if not left:
+        if frontier.keyframe in known:
+            return frontier
+        area, pose = self._keyframe_poses[frontier.keyframe]
+        rest = {k: own for k, (other, own) in self._keyframe_poses.items() if other == area and k in known}
+        if not rest:
             return None
-        nearest = min(left, key=lambda keyframe: math.dist(left[keyframe][:2], pose[:2]))
-        return Frontier(nearest, se2.transform(se2.between(left[nearest], pose), one.path), one.is_in_hallway)
+        nearest = min(rest, key=lambda keyframe: math.dist(rest[keyframe][:2], pose[:2]))
+        path = se2.transform(se2.between(rest[nearest], pose), frontier.path)
+        return Frontier(nearest, path, frontier.is_in_hallway)
 
     def _doors_in_view(self, names: list[int], placed: Float64, scans: Mapping[int, Scan]) -> Float64:
-        """All doors that keyframes show, (n, 4), in the frame of their poses."""
+        """The doors in the scans of keyframes, (n, 4), m, in the frame of their poses."""
         found = [np.empty((0, 4))]
         for keyframe, pose in zip(names, placed, strict=True):
             if keyframe not in self._classifications:
@@ -225,7 +237,7 @@ class Roadmap:
     def _connect_keyframes(
         self, names: list[int], placed: Float64, ground: NavigationGrid, pose: Float64, doors: Float64
     ) -> None:
-        """Join keyframes between which the robot can go straight."""
+        """Add edges between keyframes with a free straight line between them."""
         near = np.array([_is_near(own, pose) for own in placed])
         self.graph.add_nodes_from(keyframe for keyframe, own in zip(names, near.tolist(), strict=True) if own)
         apart = np.hypot(*(placed[:, None, :2] - placed[None, :, :2]).transpose(2, 0, 1))
@@ -233,7 +245,7 @@ class Roadmap:
         starts, ends = placed[firsts, :2], placed[seconds, :2]
         numbers = np.array(names)
         driven = (numbers[seconds] == numbers[firsts] + 1) & (apart[firsts, seconds] <= _MAX_DRIVEN_STEP)
-        # Nothing stands between places where the robot was that are nearer to each other than it is wide.
+        # Nothing is between two poses of the robot that are nearer to each other than its width.
         beside = apart[firsts, seconds] <= self._min_clearance
         joined = (near[firsts] & near[seconds]) & (driven | beside | ground.is_straight_path_free(starts, ends))
         passed = crosses_doors(np.concatenate((starts, ends), axis=1), doors)
@@ -243,47 +255,47 @@ class Roadmap:
     def _find_frontiers(
         self, names: list[int], placed: Float64, ground: NavigationGrid, pose: Float64, doors: Float64
     ) -> None:
-        """Find the frontiers, and the rooms that nobody entered: these may be seen from outside as a whole."""
+        """Add the frontiers, and unvisited rooms, which may be visible completely from outside."""
         for frontier in ground.paths_to_frontiers():
             keyframe = names[frontier.keyframe_row]
             ways = np.concatenate((frontier.points[:-1], frontier.points[1:]), axis=1)
-            # Who looks from one through a door looks into the other.
+            # A door leads from a hallway to a room, or from a room to a hallway.
             hallway = self._classifications[keyframe].is_hallway != bool(crosses_doors(ways, doors).any())
             self._add_frontier(keyframe, placed[frontier.keyframe_row], frontier.points, pose, hallway=hallway)
         for room in ground.paths_to_unvisited_rooms(doors):
             self._add_frontier(names[room.keyframe_row], placed[room.keyframe_row], room.points, pose, hallway=False)
 
     def _add_frontier(self, keyframe: int, at: Float64, points: Float64, pose: Float64, *, hallway: bool) -> None:
-        """Add what is open near the robot.
+        """Add a frontier, if it is near the robot.
 
-        :param at: pose of the keyframe from which the way (n, 2) leads there.
+        :param at: pose of the keyframe at the begin of the path (n, 2) there.
         """
         if _is_near(points[-1], pose):
             self.frontiers.append(Frontier(keyframe, se2.transform(se2.inverse(at), points), hallway))
 
     def distances(self, start: int) -> dict[int, float]:
-        """{keyframe: how far it is to there from ``start``, m}, of those that can be reached."""
+        """{keyframe: length of the path from ``start``, m} of reachable keyframes."""
         return dict(nx.single_source_dijkstra_path_length(self.graph, start, weight="length"))
 
     def shortest_path(self, start: int, end: int) -> list[int]:
-        """The shortest way over keyframes, both ends included.
+        """The keyframes of the shortest path, with both ends.
 
-        :raises networkx.NetworkXNoPath: where there is none.
+        :raises networkx.NetworkXNoPath: without a path.
         """
         return list(nx.dijkstra_path(self.graph, start, end, weight="length"))
 
     def backtracking_path(self, start: int) -> list[int]:
-        """Over the keyframes before one, the newest first; where the robot came from elsewhere, the shortest way."""
-        way = [start]
-        for keyframe in sorted((one for one in self.distances(start) if one < start), reverse=True):
-            way += self.shortest_path(way[-1], keyframe)[1:]
-        return way
+        """The path back over all earlier keyframes, the newest first, with shortest paths between them."""
+        path = [start]
+        for keyframe in sorted((each for each in self.distances(start) if each < start), reverse=True):
+            path += self.shortest_path(path[-1], keyframe)[1:]
+        return path
 
     def segments(self) -> list[set[int]]:
-        """The keyframes of hallways and of rooms, each one segment.
+        """The keyframes of hallways and rooms, one segment each.
 
-        Doors end a segment, but for those behind which there is no hallway: what one gets to from a room alone, such as
-        by a gap between furniture, is part of that room.
+        Doors end a segment. A part that is beside rooms alone, such as behind a gap between furniture, is joined to the
+        room with most keyframes beside it.
         """
         parts = sorted(nx.connected_components(self._graph_without_doors()), key=min)
         number = {keyframe: k for k, part in enumerate(parts) for keyframe in part}
@@ -294,27 +306,27 @@ class Roadmap:
                 beside[number[a]][number[b]] += 1
                 beside[number[b]][number[a]] += 1
         rooms = {k for k, part in enumerate(parts) if self.is_room(part)}
-        whole = nx.empty_graph(len(parts))
+        joined = nx.empty_graph(len(parts))
         within = (k for k in sorted(rooms) if beside[k] and rooms >= set(beside[k]))
-        whole.add_edges_from((k, beside[k].most_common(1)[0][0]) for k in within)
-        return [set().union(*(parts[k] for k in group)) for group in nx.connected_components(whole)]
+        joined.add_edges_from((k, beside[k].most_common(1)[0][0]) for k in within)
+        return [set().union(*(parts[k] for k in group)) for group in nx.connected_components(joined)]
 
     def room_around(self, keyframe: int) -> tuple[int, ...]:
-        """The keyframes around one, the nearest first, if its segment is a room; none where that is a hallway."""
-        chamber = next((own for own in self.segments() if keyframe in own), set())
-        return self._keyframes_beside(keyframe) if self.is_room(chamber) else ()
+        """The keyframes beside one, the nearest first, if its segment is a room; none in a hallway."""
+        segment = next((own for own in self.segments() if keyframe in own), set())
+        return self._keyframes_beside(keyframe) if self.is_room(segment) else ()
 
     def rooms(self) -> list[tuple[int, ...]]:
-        """Of every room that was entered, the first one first, the keyframes around its middle as in `room_around`."""
+        """The keyframes around the middle of every entered room as of `room_around`, in the order of entering."""
         rooms = sorted(
             (own for own in self.segments() if len(own) >= _MIN_ROOM_KEYFRAMES and self.is_room(own)), key=min
         )
         return [self._keyframes_beside(nx.barycenter(self.graph.subgraph(room), weight="length")[0]) for room in rooms]
 
-    def is_room(self, chamber: Collection[int]) -> bool:
-        """Whether half of a segment looks like a room: the end of a hallway does, but not all of the hallway."""
-        hallways = sum(self._classifications[keyframe].is_hallway for keyframe in chamber)
-        return len(chamber) > 0 and hallways <= 0.5 * len(chamber)
+    def is_room(self, segment: Collection[int]) -> bool:
+        """Whether at least half of the keyframes of a segment are in a room; the end of a hallway looks like one."""
+        hallways = sum(self._classifications[keyframe].is_hallway for keyframe in segment)
+        return len(segment) > 0 and hallways <= 0.5 * len(segment)
 
     def _keyframes_beside(self, keyframe: int) -> tuple[int, ...]:
         beside = {
@@ -325,7 +337,7 @@ class Roadmap:
         return (keyframe, *sorted(beside, key=lambda other: (beside[other], other)))
 
     def _graph_without_doors(self) -> nx.Graph:
-        """The roadmap without ways through doors."""
+        """The roadmap without edges through doors."""
         within = nx.Graph()
         within.add_nodes_from(self.graph)
         within.add_edges_from((a, b) for a, b, door in self.graph.edges(data="door") if not door)

@@ -1,7 +1,7 @@
-"""Rooms behind the doors of a chart to which a robot may be sent, and where it is in one of them.
+"""Rooms behind the doors of a chart: destinations in them, and the metric filter of a robot there.
 
 Tomatis, Nourbakhsh and Siegwart (2003), sections 3.4 and 3.6: the metric filter starts with the first two moments of
-what the door tells of the robot's pose. The map stays as it is.
+the robot's pose by the door. It does not change the map.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import Neighborhood, areas_around, stack_poses
-from hmt_slam_ros.landmarks.filter_selection import FilterSelector
+from hmt_slam_ros.landmarks.line_filter import FilterSelector
 from hmt_slam_ros.places.area_views import AreaViewCache
 from hmt_slam_ros.places.chart import DOOR, Chart, build_chart
 from hmt_slam_ros.places.floor import SideOpening
@@ -30,10 +30,14 @@ from hmt_slam_ros.sensors.motion_model import NO_MOTION, Prediction, RelativeMot
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 
-# Areas whose place is known this well, m, and whose keyframes are this near, m, are the surroundings of an area.
-_NEARNESS = Neighborhood(0.3, 3.0)
-# A keyframe so far behind a door, m, and beside its middle up to this share of that, was taken in the door's room.
-_BEHIND, _ASIDE = (0.8, 4.0), 0.6
+_NEIGHBORHOOD = Neighborhood(0.3, 3.0)
+"""Areas around one: deviation of their position, m, and distance of their keyframes, m, at most."""
+
+_DISTANCES_BEHIND = (0.8, 4.0)
+"""Smallest and largest distance behind a door of a keyframe in its room, m."""
+
+_MAX_SLOPE = 0.6
+"""Largest lateral offset of such a keyframe from the door's middle, as a share of its distance behind the door."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +45,7 @@ class KnownBuilding:
     """A map with its places.
 
     :ivar chart: of the map.
-    :ivar graph: of the chart.
+    :ivar graph: place graph of the chart.
     :ivar hybrid_map: the map.
     :ivar scans: {keyframe: scan}.
     """
@@ -53,9 +57,9 @@ class KnownBuilding:
 
     @classmethod
     def from_map(cls, hybrid_map: HybridMap, scans: Mapping[int, Scan], configuration: Configuration) -> KnownBuilding:
-        """Make the chart of a map.
+        """The places of a map.
 
-        :raises HmtSlamError: where no place is in it.
+        :raises HmtSlamError: for a map without places.
         """
         views = AreaViewCache(LocalMapping(configuration), scans).views_of_map(hybrid_map)
         chart = build_chart(hybrid_map, views, configuration.features)
@@ -68,7 +72,7 @@ class KnownBuilding:
 
     def keyframe_poses_around(self, area: int) -> dict[int, Float64]:
         """{keyframe: ``area_T_base`` (3,)} of an area and those around it."""
-        around = areas_around(self.hybrid_map, area, _NEARNESS)
+        around = areas_around(self.hybrid_map, area, _NEIGHBORHOOD)
         return {
             keyframe: se2.compose(frame.mean, pose)
             for other, frame in around.items()
@@ -90,50 +94,51 @@ class Destination(NamedTuple):
 
     @property
     def pose(self) -> Float64:
-        """Of a robot that comes there straight from the door, in the same frame, shape (3,)."""
+        """Pose of a robot that comes straight from the door, in the same frame, shape (3,), m and rad."""
         x, y = self.position - self.opening.landmark.pose.mean[:2]
         return np.array((*self.position, math.atan2(y, x)))
 
 
 def destinations(known: KnownBuilding) -> dict[int, Destination]:
-    """{node: the place behind its door}, where the robot was farthest in the room; of doors that it passed."""
+    """{node: destination behind its door} of doors that the robot passed, at the farthest keyframe in the room."""
     return {destination.node: destination for destination in _all_destinations(known)}
 
 
 def named_destinations(known: KnownBuilding) -> dict[str, Destination]:
-    """{name: the place in it}; "room 3" is behind "door 3", with a direction where there is one on either side."""
-    found = list(_all_destinations(known))
-    nodes = [destination.node for destination in found]
+    """{name: destination}: "room 3" is behind "door 3", with a direction if there are rooms on both sides."""
+    all_destinations = list(_all_destinations(known))
+    nodes = [destination.node for destination in all_destinations]
     return {
-        f"room {one.node}" + f" {DIRECTION_NAMES[one.opening.direction]}" * (nodes.count(one.node) > 1): one
-        for one in found
+        f"room {each.node}" + f" {DIRECTION_NAMES[each.opening.direction]}" * (nodes.count(each.node) > 1): each
+        for each in all_destinations
     }
 
 
 def _all_destinations(known: KnownBuilding) -> Iterator[Destination]:
-    """Those to whose doors a way leads; a door seen from within its room is a node by itself."""
-    reached = {edge.end for edge in known.chart.edges}
+    """The destinations behind doors with an edge; a door that only its room shows is a node without edges."""
+    with_edge = {edge.end for edge in known.chart.edges}
     for number, node in enumerate(known.chart.nodes):
-        for opening in node.openings if node.kind == DOOR and number in reached else ():
-            place = _position_behind(known, opening)
-            if place is not None:
-                yield Destination(number, opening, place)
+        for opening in node.openings if node.kind == DOOR and number in with_edge else ():
+            position = _position_behind(known, opening)
+            if position is not None:
+                yield Destination(number, opening, position)
 
 
 def _position_behind(known: KnownBuilding, opening: SideOpening) -> Float64 | None:
+    """The position of the farthest keyframe behind an opening, m, shape (2,); None for none."""
     poses = stack_poses(known.keyframe_poses_around(opening.area))
-    there = se2.transform(se2.inverse(opening.landmark.pose.mean), poses[:, :2])
-    within = (_BEHIND[0] <= there[:, 0]) & (there[:, 0] <= _BEHIND[1])
-    within &= np.abs(there[:, 1]) <= _ASIDE * there[:, 0]
+    ahead, lateral = se2.transform(se2.inverse(opening.landmark.pose.mean), poses[:, :2]).T
+    nearest, farthest = _DISTANCES_BEHIND
+    within = (nearest <= ahead) & (ahead <= farthest) & (np.abs(lateral) <= _MAX_SLOPE * ahead)
     if not within.any():
         return None
-    return np.asarray(poses[int(np.argmax(np.where(within, there[:, 0], -np.inf))), :2])
+    return np.asarray(poses[int(np.argmax(np.where(within, ahead, -np.inf))), :2])
 
 
 class RoomFilter:
     """The metric filter of a room.
 
-    :ivar area: in whose frame it is.
+    :ivar area: of its frame.
     """
 
     def __init__(self, mapping: LocalMapping, known: KnownBuilding, start: MetricInitialPose) -> None:
@@ -154,16 +159,15 @@ class RoomFilter:
         return self._filter.pose
 
     def predict(self, step: RelativeMotion) -> None:
-        """The robot moved."""
+        """Move the robot."""
         self._pending_step = self._pending_step.compose(step)
 
     def observe(self, scan: Scan) -> None:
         """Correct the pose by a scan."""
-        self._filter.track(
-            PreparedScan(self._mapping, scan), Prediction(self._pending_step, self._pending_step, self._pending_step)
-        )
+        step = self._pending_step
+        self._filter.track(PreparedScan(self._mapping, scan), Prediction(step, step, step))
         self._pending_step = NO_MOTION
 
     def release(self) -> None:
-        """Give the map up."""
+        """Release the filter."""
         self._filter.release()

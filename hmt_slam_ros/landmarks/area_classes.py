@@ -1,10 +1,9 @@
-"""Hallway or room: how long and how wide the free space around the robot, or of a stored area, is.
+"""Hallway or room: classification of the free space around the robot, or of an area.
 
-Tomatis, Nourbakhsh and Siegwart (2003), section 3.1: thin and long open spaces are hallways, others are rooms. A chord
-is how far one sees ahead and back along an axis; a space is as wide as its shortest chord, and as long as all chords
-but the longest few: through a door one sees far out of a room, too, but only along the axes that pass the door. The
-log-odds of a hallway are linear in the logarithms of both. An area is what its keyframes say on average, one after the
-other, and what it is taken for changes only where that is clear (hysteresis).
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.1: thin and long spaces are hallways, others are rooms. A chord is
+the free distance ahead and back along an axis. The width of a space is its shortest chord. Its length is a high
+quantile of the chords, as a few of them pass through doors. The log-odds of a hallway are linear in the logarithms of
+both. For an area they are averaged over its keyframes, with hysteresis.
 """
 
 from __future__ import annotations
@@ -18,28 +17,34 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.grids.virtual_scan import cast_virtual_scan
-from hmt_slam_ros.landmarks.beam_labels import Rays
-from hmt_slam_ros.landmarks.virtual_lines import rays_from_virtual_scan
+from hmt_slam_ros.landmarks.rays import Rays, rays_from_virtual_scan
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
-# Sectors of the circle, an even number, in each of which the median beam counts, so that no single beam decides; and
-# how many axes have to be known.
-_SECTORS, _MIN_CHORDS = 72, 18
-UNKNOWN_DISTANCES = np.full(_SECTORS, np.nan)
-"""How far one sees in every sector before the first scan."""
+_SECTORS = 72
+"""Sectors of the circle, an even number. The median beam of each counts, so that no single one decides."""
 
-# Nobody sees farther along a hallway than this, m; so a length does not depend on the laser's reach.
+_MIN_CHORDS = 18
+"""Known chords of a space, at least."""
+
 _MAX_DISTANCE = 10.0
-# Share of the axes along which a space is no longer than its length.
+"""Largest free distance of a sector, m, so that lengths do not depend on the laser's reach."""
+
 _LENGTH_QUANTILE = 0.925
+"""Quantile of the chords that is the length of a space."""
+
+_BEAMS, _REACH = 360, 10.0
+"""Beams of the virtual scans, and their reach, m."""
+
+UNKNOWN_DISTANCES = np.full(_SECTORS, np.nan)
+"""Free distances of the sectors before the first scan, m, shape (72,)."""
 
 
 class FreeSpace(NamedTuple):
-    """The open space around a place.
+    """Width and length of the free space around a position.
 
     :ivar width: shortest chord, m.
-    :ivar length: no more than a few of the chords are longer, m.
+    :ivar length: a high quantile of the chords, m.
     """
 
     width: float
@@ -47,10 +52,10 @@ class FreeSpace(NamedTuple):
 
 
 class AreaClass(NamedTuple):
-    """What an area is.
+    """Class of an area.
 
-    :ivar probability: that it is a hallway.
-    :ivar is_hallway: what it is taken for.
+    :ivar probability: of a hallway.
+    :ivar is_hallway: the class after hysteresis.
     """
 
     probability: float
@@ -58,37 +63,37 @@ class AreaClass(NamedTuple):
 
 
 def measure_free_space(rays: Rays) -> FreeSpace | None:
-    """The open space that beams from one place show; None where they show less than half of its axes.
+    """The free space around one scan; None where less than half of its axes are known.
 
-    :param rays: of a scan all around, real or virtual.
+    :param rays: of a real or virtual scan all around.
     """
     return space_from_distances(distances_around(rays))
 
 
 def distances_around(rays: Rays) -> Float64:
-    """How far one sees in every sector of the circle from -pi on, m, shape (72,); nan where no beam tells."""
+    """Free distance of each sector of the circle, from -pi on, m, shape (72,); nan without a beam."""
     bearings = np.arctan2(rays.directions[:, 1], rays.directions[:, 0])
     sectors = sector_indices(bearings)
     order = np.lexsort((rays.free_range, sectors))
     bounds = np.searchsorted(sectors[order], np.arange(_SECTORS + 1))
-    told = np.flatnonzero(np.diff(bounds))
-    # The two in the middle of each sector, which are one where their number is odd.
-    total = bounds[told] + bounds[told + 1]
+    known = np.flatnonzero(np.diff(bounds))
+    # Both middle beams of each sector, which are the same one for an odd number.
+    total = bounds[known] + bounds[known + 1]
     middle = rays.free_range[order[np.stack(((total - 1) // 2, total // 2))]]
-    away = np.full(_SECTORS, np.nan)
-    away[told] = np.minimum(_MAX_DISTANCE, middle.mean(axis=0))
-    return away
+    distances = np.full(_SECTORS, np.nan)
+    distances[known] = np.minimum(_MAX_DISTANCE, middle.mean(axis=0))
+    return distances
 
 
 def sector_indices(bearings: Float64) -> Int64:
-    """The sectors that bearings of any shape, rad, lie in."""
+    """The sectors of bearings of any shape, rad."""
     return np.floor((bearings + math.pi) / (2.0 * math.pi) * _SECTORS).astype(np.int64) % _SECTORS
 
 
-def space_from_distances(away: Float64) -> FreeSpace | None:
-    """The open space by how far one sees around, as `distances_around` has it."""
+def space_from_distances(distances: Float64) -> FreeSpace | None:
+    """The free space of sector distances as of `distances_around`; None where too few chords are known."""
     half = _SECTORS // 2
-    chords = away[:half] + away[half:]
+    chords = distances[:half] + distances[half:]
     chords = chords[np.isfinite(chords)]
     if chords.size < _MIN_CHORDS:
         return None
@@ -102,7 +107,7 @@ def hallway_log_odds(space: FreeSpace, features: FeatureParameters) -> float:
 
 
 def min_hallway_length(width: float, features: FeatureParameters) -> float:
-    """From which length on a space of a width is a hallway rather than a room, m; inf where length tells of none."""
+    """Length from which on a space of a width is a hallway, m; inf where no length makes one."""
     if features.hallway_ratio <= 0.0:
         return math.inf
     logarithm = math.log(max(width, 1e-3))
@@ -110,50 +115,48 @@ def min_hallway_length(width: float, features: FeatureParameters) -> float:
 
 
 def classify_area(spaces: Iterable[FreeSpace], features: FeatureParameters) -> AreaClass:
-    """What an area is by the spaces around its keyframes, in the order in which they were taken.
+    """The class of an area by the spaces around its keyframes, in the order of time.
 
-    :raises ValueError: where there is none.
+    :raises ValueError: for no space.
     """
-    total, count, taken, probability = 0.0, 0, None, 0.5
+    total, count, is_hallway, probability = 0.0, 0, None, 0.5
     for space in spaces:
         total, count = total + hallway_log_odds(space, features), count + 1
         probability = 1.0 / (1.0 + math.exp(-max(-50.0, min(50.0, total / count))))
-        taken = decide_hallway(taken, probability, features)
-    if taken is None:
-        raise ValueError("an area has no keyframe around which enough is known to tell a hallway from a room")
-    return AreaClass(probability, taken)
+        is_hallway = decide_hallway(is_hallway, probability, features)
+    if is_hallway is None:
+        raise ValueError("an area has no keyframe with enough known free space around it to classify it")
+    return AreaClass(probability, is_hallway)
 
 
 def decide_hallway(was_hallway: bool | None, probability: float, features: FeatureParameters) -> bool:
-    """What is taken for a hallway at its present probability and was ``was_hallway`` for one before; None for not
-    yet."""
+    """Whether the class is hallway, with hysteresis.
+
+    :param was_hallway: the class before; None for the first one.
+    :param probability: of a hallway now.
+    """
     bound = 0.5 if was_hallway is None else 1.0 - features.hallway_sure if was_hallway else features.hallway_sure
     return probability >= bound
 
 
-# Beams of the virtual scans, and how far they go, m.
-_BEAMS, _REACH = 360, 10.0
-
-
 class AreaClassifier:
-    """Tells areas apart, one after the other; what it needs to do so is made once."""
+    """Classifies areas by virtual scans in the grid of their keyframes."""
 
     def __init__(self, mapping: LocalMapping) -> None:
         self._mapping, self._features = mapping, mapping.configuration.features
 
     def classify(self, scans: Iterable[Scan], poses: Float64) -> AreaClass | None:
-        """What an area is; None where too little is known around its keyframes.
+        """The class of an area; None where too little is known around its keyframes.
 
-        :param scans: of its keyframes, in the order in which they were taken.
+        :param scans: of its keyframes, in the order of time.
         :param poses: shape (n, 3), their ``area_T_base``, m and rad.
         """
         table = self._mapping.pool.empty_table()
         for scan, pose in zip(scans, poses, strict=True):
             self._mapping.insert_scan(table[None], np.ascontiguousarray(pose[None]), scan)
         view = self._mapping.pool.view(table)
-        virtual = (cast_virtual_scan(view, pose, _BEAMS, _REACH) for pose in poses)
-        spaces = [
-            space for own in virtual if (space := measure_free_space(rays_from_virtual_scan(own, self._features)))
-        ]
+        scans_around = (cast_virtual_scan(view, pose, _BEAMS, _REACH) for pose in poses)
+        measured = (measure_free_space(rays_from_virtual_scan(each, self._features)) for each in scans_around)
+        spaces = [space for space in measured if space is not None]
         self._mapping.pool.release(table)
         return classify_area(spaces, self._features) if spaces else None

@@ -1,10 +1,10 @@
-"""Which observed lines are which lines of a map: the most pairings that are possible together.
+"""Data association of lines: the largest set of pairings that is compatible jointly.
 
-Joint compatibility branch and bound (Neira and Tardos 2001). Every pairing for itself may be within its gate and yet
-not all of them at once, since what is uncertain of the robot moves all lines alike.
+Joint compatibility branch and bound (Neira and Tardos 2001). Pairings may each be within their gate, and yet not all of
+them together, since an error of the pose moves all lines alike.
 
-A wrong pairing is never undone: pose and map stay wrong by the distance of the two lines. So a line that might as well
-be another one of the map, with as many pairings in all and hardly a worse fit, is paired with none.
+A wrong pairing is never undone. So an ambiguous one is left out: where another set has as many pairings and fits nearly
+as well.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry.gaussian import chi_square_gate
 
-# Difference of the squared distances of two sets of pairings of which one is a hundred times as likely as the other.
 _MIN_MARGIN = 2.0 * math.log(100.0)
+"""Difference of the squared distances of two sets, at least, for the better one to be unambiguous: a factor of 100 in
+likelihood."""
 
 
 class Pairing(NamedTuple):
@@ -28,8 +29,8 @@ class Pairing(NamedTuple):
     :ivar scan_line: number of the line in its scan.
     :ivar map_line: number of the line in the map.
     :ivar difference: (2,), alpha and r as observed minus as expected, rad and m.
-    :ivar jacobian: of what is expected by the state, (2, n).
-    :ivar noise: covariance of what is observed, (2, 2).
+    :ivar jacobian: of the expected line by the state, (2, n).
+    :ivar noise: covariance of the observed line, (2, 2).
     """
 
     scan_line: int
@@ -45,12 +46,11 @@ class Pairing(NamedTuple):
 
 
 def compatible_pairings(covariance: Float64, pairings: Sequence[Pairing], probability: float) -> list[Pairing]:
-    """The largest set of pairings, of those the one that fits best, that chi-square admits together.
+    """The unambiguous pairings of the largest set that chi-square admits; of equally large ones the best.
 
     :param covariance: of the state, (n, n).
-    :param pairings: those that are possible each for itself; an observed line is in one of the set at most.
+    :param pairings: each within its own gate; the set has one at most for each observed line.
     :param probability: that chi-square admits a true set.
-    :returns: of the set, what no other one of as many, with another line in its place, puts in doubt.
     """
     if not pairings:
         return []
@@ -66,13 +66,13 @@ class _PairingSet(NamedTuple):
     distance2: float = 0.0
 
     def is_better_than(self, other: _PairingSet) -> bool:
-        """Whether it is the larger one or, where they are equally large, fits better."""
+        """Whether the set is larger, or as large with a better fit."""
         count = len(self.chosen) - len(other.chosen)
         return count > 0 or (count == 0 and self.distance2 < other.distance2)
 
 
 class _CompatibilitySearch:
-    """A search through the choices for one observed line after the other."""
+    """Branch and bound over the choices for each observed line."""
 
     def __init__(self, covariance: Float64, pairings: Sequence[Pairing], probability: float) -> None:
         jacobian = np.concatenate([pairing.jacobian for pairing in pairings])
@@ -85,29 +85,29 @@ class _CompatibilitySearch:
         self._gates = [chi_square_gate(probability, 2 * count) for count in range(1, len(observed) + 1)]
 
     def largest_set(self, without: int | None = None) -> _PairingSet:
-        """The largest set, of those the one that fits best.
+        """The largest set; of equally large ones the best.
 
-        :param without: the number of a pairing that is not to be in it.
+        :param without: number of a pairing that is left out.
         """
         return self._search_from(0, _PairingSet(), _PairingSet(), without)
 
     def is_unambiguous(self, k: int, best: _PairingSet) -> bool:
         """Whether a pairing of the best set has no alternative."""
-        if any(own == [k] for own in self._choices):
+        if any(choices == [k] for choices in self._choices):
             return True
         other = self.largest_set(without=k)
         return len(other.chosen) < len(best.chosen) or other.distance2 - best.distance2 > _MIN_MARGIN
 
     def _search_from(self, level: int, chosen: _PairingSet, best: _PairingSet, without: int | None) -> _PairingSet:
-        """The better of a set and the best one that ``chosen`` leads to by the observed lines from ``level`` on."""
-        left = len(self._choices) - level
-        if not left:
+        """The better of a set and the best extension of ``chosen`` by the observed lines from ``level`` on."""
+        remaining = len(self._choices) - level
+        if not remaining:
             return chosen if chosen.is_better_than(best) else best
         for k in self._choices[level]:
             longer = self._add_pairing(chosen, k)
             if k != without and longer.distance2 <= self._gates[len(chosen.chosen)]:
                 best = self._search_from(level + 1, longer, best, without)
-        if len(chosen.chosen) + left > len(best.chosen):
+        if len(chosen.chosen) + remaining > len(best.chosen):
             best = self._search_from(level + 1, chosen, best, without)
         return best
 

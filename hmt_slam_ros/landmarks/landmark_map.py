@@ -1,10 +1,9 @@
-"""The landmarks of one area in its frame, gathered over many scans, and whether each is still there.
+"""Landmark map of one area: poses and existence of its landmarks, over many scans.
 
-Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: a landmark that a scan shows is one of the map where the distance
-of the two is within chi-square's gate and they are of one kind, else it is new. Poses that a scan's landmarks have in
-common, as its own error, and the errors of the map that virtual scans are cast in make observations of one landmark
-depend on each other, in a way that nobody knows. So they are fused by covariance intersection (Julier and Uhlmann,
-1997), with a weight of 1/n for the n-th: what is known of a landmark is what its observations say on average.
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: an observed landmark is one of the map if both are of one kind and
+their distance is within a chi-square gate; else it is new. Observations of one landmark are correlated by the error of
+a scan's pose, and by that of the grid of virtual scans, in an unknown way. So they are fused by covariance intersection
+(Julier and Uhlmann 1997), with a weight of 1/n for the n-th.
 """
 
 from __future__ import annotations
@@ -19,20 +18,24 @@ from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, fuse
 from hmt_slam_ros.hybrid_map.landmark import Existence, Landmark
-from hmt_slam_ros.landmarks.beam_labels import Rays
 from hmt_slam_ros.landmarks.landmarks import OPENING, ScanLandmarks, should_be_visible
+from hmt_slam_ros.landmarks.rays import Rays
 
-# Beyond this distance, m, nothing is compared.
 _MAX_PAIR_DISTANCE = 2.0
+"""Largest distance between landmarks that are compared, m."""
+
+_MAX_SAME_HEADING = 0.5
+"""Largest difference in heading of a new landmark from a known one that it duplicates, rad."""
 
 
 def scatter_ratio(landmarks: Iterable[Landmark]) -> Float64:
-    """Birge's ratio of an area's openings, for all axes together: by how much what is stated of a sighting is too large
-    or too small, as sightings of one opening are apart. Shape (3, 3), in deviations; one more sighting is as stated.
+    """Birge's ratio of an area's openings: the scatter of their observations against its covariance, shape (3, 3).
+
+    It is in deviations, with one observation of ratio 1 added.
     """
-    openings = [one for one in landmarks if one.kind == OPENING]
-    again = sum(one.existence.detections - 1 for one in openings)
-    return np.asarray((np.eye(3) + sum(one.scatter for one in openings)) / (1 + again))
+    openings = [landmark for landmark in landmarks if landmark.kind == OPENING]
+    repeated = sum(opening.existence.detections - 1 for opening in openings)
+    return np.asarray((np.eye(3) + sum(opening.scatter for opening in openings)) / (1 + repeated))
 
 
 class LandmarkMap:
@@ -42,58 +45,59 @@ class LandmarkMap:
     """
 
     def __init__(self, features: FeatureParameters, begin: Callable[[float], Existence] = Existence) -> None:
-        """:param begin: what is known of a landmark's existence at first, by its extraction confidence."""
+        """:param begin: existence of a new landmark, by its extraction confidence."""
         self._features, self._initial_existence = features, begin
         self._gate = chi_square_gate(features.pair_probability)
         self.landmarks: list[Landmark] = []
 
     def observe(self, pose: PoseGaussian, landmarks: ScanLandmarks, rays: Rays, *, is_virtual: bool = False) -> None:
-        """Learn what a scan shows, and what it does not show though it should.
+        """Update poses and existence by a scan: by its landmarks, and by those that it misses.
 
-        :param pose: the belief over ``area_T_base``.
-        :param landmarks: the landmarks of the scan, in the frame of the base.
-        :param rays: its beams, likewise.
+        :param pose: belief over ``area_T_base``.
+        :param landmarks: of the scan, in the frame of the base.
+        :param rays: of the scan, in the frame of the base.
         :param is_virtual: whether the scan is a virtual one.
         """
         features = self._features
         if is_virtual:
             features = replace(features, landmark_detected=features.landmark_detected_in_map)
         expected = self._should_be_visible(pose.mean, rays)
-        placed = [
+        observed_poses = [
             pose.compose(PoseGaussian(*each)) for each in zip(landmarks.poses, landmarks.covariances, strict=True)
         ]
-        pairs = dict(self._associate(placed, landmarks))
+        matches = dict(self._associate(observed_poses, landmarks))
         known = len(self.landmarks)
         for k, landmark in enumerate(self.landmarks):
-            if k in pairs:
-                self.landmarks[k] = _update_landmark(landmark, placed[pairs[k]], landmarks, pairs[k], features)
+            i = matches.get(k)
+            if i is not None:
+                self.landmarks[k] = _update_landmark(landmark, observed_poses[i], landmarks, i, features)
             elif expected[k]:
                 existence = landmark.existence.update_on_miss(features)
                 self.landmarks[k] = replace(landmark, existence=existence)
-        for i in sorted(set(range(len(placed))).difference(pairs.values())):
-            if not self._is_near_known(placed[i], int(landmarks.kinds[i]), known):
-                self.landmarks.append(self._new_landmark(placed[i], landmarks, i))
+        for i in sorted(set(range(len(observed_poses))).difference(matches.values())):
+            if not self._is_near_known(observed_poses[i], int(landmarks.kinds[i]), known):
+                self.landmarks.append(self._new_landmark(observed_poses[i], landmarks, i))
         least = self._features.landmark_least
-        self.landmarks = [one for one in self.landmarks if one.existence.probability >= least]
+        self.landmarks = [landmark for landmark in self.landmarks if landmark.existence.probability >= least]
 
     def begin_visit(self) -> None:
-        """The robot comes back after a while."""
-        self.landmarks = [replace(one, existence=one.existence.mark_absence()) for one in self.landmarks]
+        """Note that the robot was away since the last scan."""
+        self.landmarks = [replace(each, existence=each.existence.mark_absence()) for each in self.landmarks]
 
     def _should_be_visible(self, pose: Float64, rays: Rays) -> Bool:
-        """Which landmarks the scan from a pose should show."""
+        """Whether landmarks should be visible from a pose, shape (n,)."""
         kinds = np.array([landmark.kind for landmark in self.landmarks], dtype=np.int64)
         poses = np.array([landmark.pose.mean for landmark in self.landmarks]).reshape(-1, 3)
         widths = np.array([landmark.width for landmark in self.landmarks])
         return should_be_visible(kinds, se2.between(pose, poses), widths, rays, self._features)
 
-    def _associate(self, placed: list[PoseGaussian], seen: ScanLandmarks) -> Iterator[tuple[int, int]]:
-        """Landmarks of the map and of the scan that are one, the nearest first."""
+    def _associate(self, observed_poses: list[PoseGaussian], observed: ScanLandmarks) -> Iterator[tuple[int, int]]:
+        """Pairs of numbers of landmarks in the map and in the scan that are one, the nearest first."""
         near = sorted(
             (distance2, k, i)
-            for i, pose in enumerate(placed)
+            for i, pose in enumerate(observed_poses)
             for k, landmark in enumerate(self.landmarks)
-            if landmark.kind == seen.kinds[i] and _distance(landmark.pose, pose) < _MAX_PAIR_DISTANCE
+            if landmark.kind == observed.kinds[i] and _distance(landmark.pose, pose) < _MAX_PAIR_DISTANCE
             if (distance2 := landmark.pose.mahalanobis2(pose)) <= self._gate
         )
         taken: tuple[set[int], set[int]] = set(), set()
@@ -103,35 +107,35 @@ class LandmarkMap:
                 taken[1].add(i)
                 yield k, i
 
-    def _new_landmark(self, pose: PoseGaussian, seen: ScanLandmarks, i: int) -> Landmark:
+    def _new_landmark(self, pose: PoseGaussian, observed: ScanLandmarks, i: int) -> Landmark:
         into = np.linalg.inv(np.linalg.cholesky(pose.covariance))
         return Landmark(
-            int(seen.kinds[i]),
+            int(observed.kinds[i]),
             pose,
-            float(seen.widths[i]),
-            float(seen.width_deviations[i]),
-            self._initial_existence(float(seen.confidences[i])),
-            scan_covariance_share=into @ seen.covariances[i] @ into.T,
+            float(observed.widths[i]),
+            float(observed.width_deviations[i]),
+            self._initial_existence(float(observed.confidences[i])),
+            scan_covariance_share=into @ observed.covariances[i] @ into.T,
         )
 
     def _is_near_known(self, pose: PoseGaussian, kind: int, known: int) -> bool:
-        """Whether a landmark is so near to a known one of its kind that it is no other one."""
+        """Whether a landmark duplicates one of the first ``known`` of the map."""
         return any(
             landmark.kind == kind
             and _distance(landmark.pose, pose) < self._features.landmark_apart
-            and abs(float(se2.wrap(landmark.pose.mean[2] - pose.mean[2]))) < 0.5
+            and abs(float(se2.wrap(landmark.pose.mean[2] - pose.mean[2]))) < _MAX_SAME_HEADING
             for landmark in self.landmarks[:known]
         )
 
 
 def _update_landmark(
-    landmark: Landmark, pose: PoseGaussian, seen: ScanLandmarks, i: int, features: FeatureParameters
+    landmark: Landmark, pose: PoseGaussian, observed: ScanLandmarks, i: int, features: FeatureParameters
 ) -> Landmark:
     """A landmark after one more observation of it."""
     n = landmark.existence.detections + 1
-    width, deviation = seen.widths[i], seen.width_deviations[i]
+    width, deviation = observed.widths[i], observed.width_deviations[i]
     into = np.linalg.inv(np.linalg.cholesky(pose.covariance))
-    # Welford's update: by what a sighting and the mean of those before it may be apart.
+    # Welford's update, in deviations of the difference between an observation and the mean before it.
     spread = np.linalg.cholesky(pose.covariance + landmark.pose.covariance / (n - 1))
     off = np.linalg.solve(spread, se2.log(se2.between(pose.mean, landmark.pose.mean)))
     return replace(
@@ -139,15 +143,15 @@ def _update_landmark(
         pose=_intersect_covariances(landmark.pose, pose, 1.0 / n),
         scatter=landmark.scatter + np.outer(off, off),
         scan_covariance_share=landmark.scan_covariance_share
-        + (into @ seen.covariances[i] @ into.T - landmark.scan_covariance_share) / n,
+        + (into @ observed.covariances[i] @ into.T - landmark.scan_covariance_share) / n,
         width=landmark.width + float(width - landmark.width) / n,
         width_deviation=landmark.width_deviation + float(deviation - landmark.width_deviation) / n,
-        existence=landmark.existence.update_on_detection(float(seen.confidences[i]), features),
+        existence=landmark.existence.update_on_detection(float(observed.confidences[i]), features),
     )
 
 
-def _distance(one: PoseGaussian, other: PoseGaussian) -> float:
-    return float(np.hypot(*(one.mean[:2] - other.mean[:2])))
+def _distance(first: PoseGaussian, second: PoseGaussian) -> float:
+    return float(np.hypot(*(first.mean[:2] - second.mean[:2])))
 
 
 def _intersect_covariances(known: PoseGaussian, seen: PoseGaussian, weight: float) -> PoseGaussian:

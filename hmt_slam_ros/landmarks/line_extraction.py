@@ -1,10 +1,13 @@
-"""The lines that a scan shows.
+"""Line extraction from scans, real or virtual.
 
 A beam costs the square of its residual in range, in deviations; a line costs a penalty, and a beam on no line another.
-The cheapest partition follows by dynamic programming over the beams (optimal partitioning, Jackson et al. 2005), in
-which starts that cannot become better any more are left out (PELT, Killick et al. 2012). So where a wall ends is
-decided by all beams on both sides of its end, not by one threshold on one of them. Across a gap in which no beam
-returned nothing is sorted into one line: that it goes on there, only its two pieces can tell.
+The cheapest partition follows by dynamic programming over the beams (optimal partitioning, Jackson et al. 2005), with
+pruning of starts that cannot become better (PELT, Killick et al. 2012). So all beams on both sides decide where a wall
+ends, not a threshold on one of them. No line of the partition crosses a gap without returns; lines on both sides of a
+gap may be merged later.
+
+A grid has other errors than a laser: across its surfaces, and common to neighboring beams that end in the same cells.
+So each end of a line of a virtual scan has an independent deviation of ``features.map_deviation`` in addition.
 """
 
 from __future__ import annotations
@@ -18,10 +21,25 @@ from numba import njit
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry.gaussian import chi_square_gate
+from hmt_slam_ros.grids.virtual_scan import VirtualScan
 from hmt_slam_ros.landmarks.line_fit import Beams, MergeGate, fit_line, merge_lines, relabel
+from hmt_slam_ros.landmarks.rays import range_deviations_of_map
 from hmt_slam_ros.sensors import Scan
 
-_NO_LINE = -1
+_NONE = -1
+"""Label of a beam on no line."""
+
+_AMBIGUOUS = 3.0
+"""A beam at the common end of two lines that is within so many deviations of the other one belongs to neither."""
+
+_STRAY = 3.5
+"""A beam more than so many deviations from its line does not belong to it."""
+
+_MAX_BEND = 1.0
+"""Largest second-order change of r over the uncertainty of alpha, in deviations of r."""
+
+_CORRELATED_BEAMS = 2.0
+"""Neighboring beams of a virtual scan with a common error: the factor on its penalties."""
 
 
 @njit(cache=True)
@@ -42,8 +60,8 @@ def partition_beams(
     end, count = len(rays), 0
     while end > 0:
         start = starts[end - 1]
-        if start == _NO_LINE:
-            labels[end - 1] = _NO_LINE
+        if start == _NONE:
+            labels[end - 1] = _NONE
             end -= 1
         else:
             labels[start:end] = count
@@ -56,11 +74,11 @@ def partition_beams(
 def _optimal_starts(
     rays: Float64, begins: Int32, deviations: Float64, line_penalty: float, stray_penalty: float
 ) -> Int32:
-    """Where the line begins that ends with each beam in the cheapest partition up to it; -1 where it is on none."""
+    """First beam of the line that ends with each beam in the cheapest partition up to it; -1 for no line."""
     count = len(rays)
     costs, starts = np.zeros(count + 1), np.empty(count, np.int32)
     for last in range(count):
-        best, start = costs[last] + stray_penalty, _NO_LINE
+        best, start = costs[last] + stray_penalty, _NONE
         # Sums over the beams from `first` to `last` of r^4 d d', r^3 d and r^2 by the variance of r, d being the
         # direction: on a line the inverse of the range is linear in d, and its deviation is that of the range by r^2.
         xx = xy = yy = x = y = square = 0.0
@@ -74,7 +92,7 @@ def _optimal_starts(
             if last - first > 1 and determinant > 0.0:
                 misfit = square - (yy * x * x - 2.0 * xy * x * y + xx * y * y) / determinant
             cost = costs[first] + max(0.0, misfit)
-            # No line that begins before this one can cost less than it does without its penalty.
+            # No line with an earlier start can cost less than this one without its penalty.
             if cost >= best:
                 break
             if cost + line_penalty < best:
@@ -83,26 +101,17 @@ def _optimal_starts(
     return starts
 
 
-# A beam this near to its neighbour's line, in deviations, may belong to either of the two.
-_AMBIGUOUS = 3.0
-# A beam this far from its line, in deviations, does not belong to it.
-_STRAY = 3.5
-# What a line bends over its uncertainty, in deviations across it.
-_MAX_BEND = 1.0
-_NONE = -1
-
-
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Infinite lines n(alpha) p = r with what was seen of them, in the robot's frame at the scan's stamp.
+    """Infinite lines n(alpha) p = r with their visible segments, in the robot's frame at the scan's stamp.
 
     :ivar parameters: shape (n, 2), alpha in [-pi, pi) and r >= 0: direction and length of the perpendicular from the
         origin, rad and m.
     :ivar covariances: shape (n, 2, 2), of alpha and r.
-    :ivar segments: shape (m, 2), where each stretch that was seen begins and ends, m along its line's direction
+    :ivar segments: shape (m, 2), begin and end of each visible segment, m along its line's direction
         (-sin(alpha), cos(alpha)) from the foot of the perpendicular.
-    :ivar owners: shape (m,), the line of each of them, increasing.
-    :ivar labels: shape (k,), the line of each beam with a return, -1 where it shows none.
+    :ivar owners: shape (m,), the line of each segment, increasing.
+    :ivar labels: shape (k,), the line of each beam with a return, -1 for none.
     """
 
     parameters: Float64
@@ -116,7 +125,7 @@ class Lines:
 
 
 def extract_lines(scan: Scan, features: FeatureParameters, deviations: Float64 | None = None) -> Lines:
-    """The lines of a scan of any field of view and number of beams; none where it has no return.
+    """The lines of a scan with any field of view; none for a scan without returns.
 
     :param deviations: shape (k,), of the ranges of the beams with a return, m; ``features.range_deviation`` for all
         where None.
@@ -143,32 +152,32 @@ def extract_lines(scan: Scan, features: FeatureParameters, deviations: Float64 |
 
 
 def extract_for_map(scan: Scan, features: FeatureParameters) -> Lines:
-    """The lines of a scan that a stochastic map observes: it joins them itself when it knows more."""
+    """The lines of a scan for a stochastic map, which merges lines itself when it knows more."""
     return extract_lines(scan, replace(features, merge_deviation=features.map_merge_deviation))
 
 
 def _is_nearly_linear(lines: Float64) -> Bool:
-    """Which of the lines (n, 5) are so certain that a Gaussian over alpha and r is right.
+    """Whether lines (n, 5) are so certain that a Gaussian over alpha and r is valid, shape (n,).
 
-    r follows from alpha as n(alpha) c for the middle c of what was seen, whose second derivative is -r: where that
-    bends by more than r is uncertain at an exact alpha, no covariance says what is known.
+    r depends on alpha as n(alpha) c for the middle c of the visible part, with the second derivative -r. Where this
+    term exceeds the uncertainty of r at an exact alpha, no covariance is valid.
     """
     aa, ar, rr = lines[:, 2], lines[:, 3], lines[:, 4]
     return lines[:, 1] * aa <= _MAX_BEND * np.sqrt(rr - ar * ar / aa)
 
 
-def _select_lines(found: Float64, pieces: Float64, owners: Int64, labels: Int32, kept: Bool) -> Lines:
-    """The lines that are kept, numbered anew."""
-    numbers = np.where(kept, np.cumsum(kept) - 1, _NONE)
+def _select_lines(found: Float64, pieces: Float64, owners: Int64, labels: Int32, chosen: Bool) -> Lines:
+    """The chosen lines, renumbered."""
+    numbers = np.where(chosen, np.cumsum(chosen) - 1, _NONE)
     labels = np.append(numbers, _NONE)[labels].astype(np.int32)
-    own, found = kept[owners], found[kept]
+    own, found = chosen[owners], found[chosen]
     covariances = found[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
     return Lines(found[:, :2], covariances, pieces[own], numbers[owners[own]], labels)
 
 
 @njit(cache=True)
 def _gap_starts(points: Float64, numbers: Int64, max_gap: float) -> Int32:
-    """The first beam (n,) behind the last gap before each: of two beams or more without a return, and as wide."""
+    """The first beam (n,) behind the last gap before each: two beams or more without a return, and wide enough."""
     begins, begin = np.empty(len(points), np.int32), 0
     for k in range(len(points)):
         if k:
@@ -180,16 +189,16 @@ def _gap_starts(points: Float64, numbers: Int64, max_gap: float) -> Int32:
 
 @njit(cache=True)
 def _is_gap(before: int, after: int) -> bool:
-    """Whether between two beams of these numbers there are two or more, and not just one that was lost."""
+    """Whether two or more beams are between two beam numbers; a single one may be lost."""
     return after - before > 2
 
 
 @njit(cache=True)
 def _extract(beams: Beams, labels: Int32, count: int, min_beams: int, gate: MergeGate) -> Float64:
-    """Fit the segments that beams were sorted into, join those that are one line, and leave out what is doubtful.
+    """Fit the segments of a partition, merge those of one line, and drop ambiguous beams.
 
     :param labels: shape (k,), the segment of each beam, -1 for none; written to: the line.
-    :param count: of the segments.
+    :param count: number of segments.
     :param gate: of segments that are one line.
     :returns: the lines (n, 5), as of `fit_line`, numbered as the labels.
     """
@@ -209,7 +218,7 @@ def _extract(beams: Beams, labels: Int32, count: int, min_beams: int, gate: Merg
 
 @njit(cache=True)
 def _fit_all(beams: Beams, labels: Int32, lines: Float64, count: int, min_beams: int) -> int:
-    """Fit every label, give up those of too few beams, and return how many there are."""
+    """Fit a line to each label, drop those with too few beams, and return the number of the rest."""
     kept = 0
     for line in range(count):
         enough = fit_line(beams, labels, line, lines[kept]) >= min_beams
@@ -220,10 +229,9 @@ def _fit_all(beams: Beams, labels: Int32, lines: Float64, count: int, min_beams:
 
 @njit(cache=True)
 def _drop_ambiguous_beams(beams: Beams, labels: Int32, lines: Float64) -> None:
-    """Take from both lines the beams at their common end that may belong to either.
+    """Remove the beams at the common end of two lines that may belong to either.
 
-    Where two walls meet, the partition gives a beam to that line which it fits better, so that both lines would be
-    fitted to errors of one sign at their ends.
+    The partition gives such a beam to the line that fits better, so that both would be fitted to errors of one sign.
     """
     given = labels.copy()
     for k in range(1, len(labels)):
@@ -235,7 +243,7 @@ def _drop_ambiguous_beams(beams: Beams, labels: Int32, lines: Float64) -> None:
 
 @njit(cache=True)
 def _drop_run_ends(labels: Int32) -> None:
-    """Take the label from the first and the last beam of every run, which may have met an edge or what is behind it."""
+    """Remove the first and the last beam of each run, which may have met an edge or a surface behind it."""
     before = labels[0] if len(labels) else _NONE
     for k in range(1, len(labels)):
         own = labels[k]
@@ -245,16 +253,16 @@ def _drop_run_ends(labels: Int32) -> None:
 
 
 @njit(cache=True)
-def _unlabel_near(beams: Beams, labels: Int32, neighbour: Float64, k: int, step: int, own: int) -> None:
-    """Take the label from the beams from ``k`` on that are near to the neighbour's line."""
-    while 0 <= k < len(labels) and labels[k] == own and _is_on_line(beams, k, neighbour, _AMBIGUOUS):
+def _unlabel_near(beams: Beams, labels: Int32, neighbor: Float64, k: int, step: int, own: int) -> None:
+    """Remove the beams from ``k`` on that are near the neighboring line."""
+    while 0 <= k < len(labels) and labels[k] == own and _is_on_line(beams, k, neighbor, _AMBIGUOUS):
         labels[k] = _NONE
         k += step
 
 
 @njit(cache=True)
 def _drop_stray_beams(beams: Beams, labels: Int32, lines: Float64) -> None:
-    """Take the label from beams that are too far from their line."""
+    """Remove beams that are too far from their line."""
     for k in range(len(labels)):
         if labels[k] != _NONE and not _is_on_line(beams, k, lines[labels[k]], _STRAY):
             labels[k] = _NONE
@@ -262,7 +270,7 @@ def _drop_stray_beams(beams: Beams, labels: Int32, lines: Float64) -> None:
 
 @njit(cache=True)
 def _extend_lines(beams: Beams, labels: Int32, lines: Float64, step: int) -> None:
-    """Label the beams on no line beside those on one as far as they are on it too; it stays as it was fitted."""
+    """Add the beams beside a line that are on it, without a new fit."""
     last = _NONE
     for n in range(len(labels)):
         k = n if step > 0 else len(labels) - 1 - n
@@ -273,7 +281,7 @@ def _extend_lines(beams: Beams, labels: Int32, lines: Float64, step: int) -> Non
 
 @njit(cache=True)
 def _is_on_line(beams: Beams, k: int, line: Float64, deviations: float) -> bool:
-    """Whether a beam ends so few deviations of its range from a line (5,)."""
+    """Whether a beam ends within some deviations of its range from a line (5,)."""
     cos, sin = math.cos(line[0]), math.sin(line[0])
     off = cos * beams.points[k, 0] + sin * beams.points[k, 1] - line[1]
     facing = abs(cos * beams.directions[k, 0] + sin * beams.directions[k, 1])
@@ -284,9 +292,9 @@ def _is_on_line(beams: Beams, k: int, line: Float64, deviations: float) -> bool:
 def _visible_segments(
     points: Float64, numbers: Int64, labels: Int32, lines: Float64, max_gap: float
 ) -> tuple[Float64, Int64]:
-    """What was seen of each line, (m, 2), m along it, and whose each is.
+    """The visible segments of lines, (m, 2), m along them, and the line of each, (m,).
 
-    A stretch ends where the next beam of the line is farther away than a gap, with two beams or more in between.
+    A segment ends where the next beam of the line is farther than a gap, with two beams or more in between.
     """
     pieces, owners, count = np.empty((len(points), 2)), np.empty(len(points), np.int64), 0
     for line in range(len(lines)):
@@ -304,3 +312,21 @@ def _visible_segments(
             pieces[count - 1, 1] = max(pieces[count - 1, 1], along)
             before, last = k, along
     return pieces[:count], owners[:count]
+
+
+def extract_map_lines(virtual: VirtualScan, features: FeatureParameters) -> Lines:
+    """The lines of a virtual scan."""
+    costs = replace(
+        features,
+        line_penalty=_CORRELATED_BEAMS * features.line_penalty,
+        stray_penalty=_CORRELATED_BEAMS * features.stray_penalty,
+    )
+    lines = extract_lines(virtual.scan, costs, range_deviations_of_map(virtual, features)[virtual.scan.valid])
+    begins, ends = np.full(len(lines), np.inf), np.full(len(lines), -np.inf)
+    np.minimum.at(begins, lines.owners, lines.segments[:, 0])
+    np.maximum.at(ends, lines.owners, lines.segments[:, 1])
+    variance = features.map_deviation**2
+    middles, turn, shift = 0.5 * (begins + ends), 2.0 * variance / (ends - begins) ** 2, 0.5 * variance
+    entries = (turn, middles * turn, middles * turn, middles * middles * turn + shift)
+    of_grid = np.stack(entries, axis=1).reshape(-1, 2, 2)
+    return replace(lines, covariances=lines.covariances + of_grid)

@@ -1,13 +1,13 @@
-"""The extended Kalman filter of one hypothesis in its current area, whose local map is one of lines.
+"""The line filter: an extended Kalman filter over lines as local filter, and the choice of a filter by area class.
 
-A map of lines does not know where space is free. What contradicts it is that a beam passes a wall where it was seen:
-it ends behind it.
+It is the stochastic map of Tomatis, Nourbakhsh and Siegwart (2003), section 3.6, in the place of the particles and
+grids of Blanco et al. (2008). Each scan corrects robot, lines and the poses of keyframes: along a hallway all of these
+drift until its end is visible again. The lines of an area that is entered come from the scans of its keyframes.
 
-The stochastic map of Tomatis, Nourbakhsh and Siegwart (2003), section 3.6, in the place of the particles and grids of
-Blanco et al. (2008). Every scan corrects robot and lines; of a keyframe is noted where it was taken, and corrected
-too: along a hallway whose end people hide the robot drifts, and so do its keyframes, until the end is seen again. The
-lines of an area that is entered come from the scans of its keyframes.
-"""
+A map of lines has no free space. A scan contradicts it where a beam passes a known wall and ends behind it.
+
+
+Which kind of filter an area has: one with a grid, one with lines, or by what the area is."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, matrix_inverse, propagate_covariance
 from hmt_slam_ros.geometry.se2 import rotate_back
+from hmt_slam_ros.landmarks.area_classes import AreaClassifier
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_for_map
 from hmt_slam_ros.landmarks.stochastic_map import LineAssociations, LineMap
 from hmt_slam_ros.registration.consistency import (
@@ -40,103 +41,87 @@ from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import NO_MOTION, Prediction, RelativeMotion
 from hmt_slam_ros.submap.line_map_state import PoseClones
-from hmt_slam_ros.submap.local_filter import FilterStep, LineFilterState, PlacedKeyframe, TrackedMotion
+from hmt_slam_ros.submap.local_filter import (
+    FilterStep,
+    LineFilterState,
+    LocalFilter,
+    ParticleFilterState,
+    PlacedKeyframe,
+    TrackedMotion,
+)
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
+from hmt_slam_ros.submap.particle_filter import ParticleFilter
+
+_END_MARGIN = 0.2
+"""Distance from the visible ends of a wall within which no beam counts as passing it, m."""
+
+_KEYFRAME_COVARIANCE = np.diag([0.01, 0.01, math.radians(0.3)]) ** 2
+"""Covariance of the independent errors of keyframes in a loaded area, m and rad."""
+
+_MIN_CORRECTION = 0.01
+"""Corrections of keyframes from which on they are reported, m."""
+
+_MIN_MATCHED_SHARE = 0.5
+"""Smallest share of a scan's lines that match by odometry; below, odometry is compared with inertia."""
 
 
 def lines_of_scan(scan: Scan, configuration: Configuration) -> Lines:
-    """The lines of a scan that a map of lines is compared with."""
+    """The lines of a scan for the stochastic map."""
     return extract_for_map(scan, configuration.features)
 
 
-# A beam passes a wall if it does so at least so far from where the wall was seen to end, m.
-_END_MARGIN = 0.2
-
-
-class BeamWallCounts(NamedTuple):
-    """What the beams of a scan say of walls.
-
-    :ivar beams_ending: beams that end on one.
-    :ivar beams_passing: beams that pass one.
-    :ivar samples_hit: samples of walls that beams end on.
-    :ivar samples_passed: samples that beams pass.
-    """
-
-    beams_ending: int
-    beams_passing: int
-    samples_hit: int
-    samples_passed: int
-
-
-def count_beams_at_walls(ends: Float64, laser: Float64, line_map: LineMap, near: float) -> BeamWallCounts:
-    """Lay beams into a map of lines.
-
-    :param ends: of the beams in their order, shape (n, 2), m, frame of the map.
-    :param laser: where they begin, shape (2,), likewise.
-    :param near: distance, m, from a wall below which a beam ends on it.
-    """
-    stretches = [(*line_map.lines[line], *piece) for line, wall in enumerate(line_map.walls) for piece in wall.segments]
-    return BeamWallCounts(*_count_beams(ends, laser, _segment_array(stretches), near))
-
-
-def _segment_array(stretches: Sequence[tuple[float, ...]]) -> Float64:
-    return np.array(stretches, dtype=np.float64).reshape(-1, 4)
-
-
 @njit(cache=True)
-def _count_beams(ends: Float64, laser: Float64, stretches: Float64, near: float) -> tuple[int, int, int, int]:
-    """:param stretches: alpha, r, begin and end of each, (m, 4)."""
+def _count_beams(ends: Float64, laser: Float64, segments: Float64, near: float) -> tuple[int, int, int, int]:
+    """Numbers of beams that end on a wall and that pass one, and of samples of walls that are hit and passed.
+
+    :param ends: of the beams, in their order, shape (n, 2), m, frame of the map.
+    :param laser: its position, shape (2,), m, frame of the map.
+    :param segments: alpha, r, begin and end of each, shape (m, 4).
+    :param near: distance from a wall below which a beam ends on it, m.
+    """
     ending = passing = 0
     met, passed = NO_SAMPLES, NO_SAMPLES
     at = np.empty(2)
     for i in range(len(ends)):
-        if _ends_on_wall(ends[i], stretches, near):
+        if _ends_on_wall(ends[i], segments, near):
             ending += 1
             met = add_wall_hit(met, ends[i, 0], ends[i, 1], SAMPLE_SPACING)
-        elif _passes_wall(ends[i], laser, stretches, at):
+        elif _passes_wall(ends[i], laser, segments, at):
             passing += 1
             passed = add_wall_passed(passed, at[0], at[1], SAMPLE_SPACING, MAX_SAMPLE_GAP)
     return ending, passing, met.total, passed.total
 
 
 @njit(cache=True)
-def _ends_on_wall(end: Float64, stretches: Float64, near: float) -> bool:
-    for k in range(len(stretches)):
-        cos, sin = math.cos(stretches[k, 0]), math.sin(stretches[k, 0])
+def _ends_on_wall(end: Float64, segments: Float64, near: float) -> bool:
+    for k in range(len(segments)):
+        cos, sin = math.cos(segments[k, 0]), math.sin(segments[k, 0])
         across, along = rotate_back(cos, sin, end[0], end[1])
-        if abs(across - stretches[k, 1]) < near and stretches[k, 2] - near < along < stretches[k, 3] + near:
+        if abs(across - segments[k, 1]) < near and segments[k, 2] - near < along < segments[k, 3] + near:
             return True
     return False
 
 
 @njit(cache=True)
-def _passes_wall(end: Float64, laser: Float64, stretches: Float64, at: Float64) -> bool:
-    """Whether a beam passes a wall from the side from which it was seen; where it does first is written to ``at``."""
+def _passes_wall(end: Float64, laser: Float64, segments: Float64, at: Float64) -> bool:
+    """Whether a beam passes a wall from its visible side; writes the first point where it does to ``at``."""
     first = np.inf
-    for k in range(len(stretches)):
-        cos, sin = math.cos(stretches[k, 0]), math.sin(stretches[k, 0])
-        before = stretches[k, 1] - cos * laser[0] - sin * laser[1]
-        behind = cos * end[0] + sin * end[1] - stretches[k, 1]
+    for k in range(len(segments)):
+        cos, sin = math.cos(segments[k, 0]), math.sin(segments[k, 0])
+        before = segments[k, 1] - cos * laser[0] - sin * laser[1]
+        behind = cos * end[0] + sin * end[1] - segments[k, 1]
         if before <= 0.0 or behind < BEHIND:
             continue
         share = before / (before + behind)
         x, y = laser[0] + share * (end[0] - laser[0]), laser[1] + share * (end[1] - laser[1])
         along = cos * y - sin * x
-        if share < first and stretches[k, 2] + _END_MARGIN < along < stretches[k, 3] - _END_MARGIN:
+        if share < first and segments[k, 2] + _END_MARGIN < along < segments[k, 3] - _END_MARGIN:
             first, at[0], at[1] = share, x, y
     return first < np.inf
 
 
-# How well keyframes lie in the frame of an area that is loaded: they err independently, m and rad.
-_KEYFRAME_COVARIANCE = np.diag([0.01, 0.01, math.radians(0.3)]) ** 2
-# Keyframes that were corrected by more than this, m, are told anew.
-_MIN_CORRECTION = 0.01
-# Odometry of which more than this share of a scan's lines knows nothing in the map may be wrong.
-_MIN_MATCHED_SHARE = 0.5
-
-
 class _MapPosterior(NamedTuple):
-    """A map after a scan, under one prediction of the motion."""
+    """The map after a scan, for one prediction of the motion."""
 
     line_map: LineMap
     motion: RelativeMotion
@@ -144,10 +129,10 @@ class _MapPosterior(NamedTuple):
 
 
 class LineFilter:
-    """One Gaussian over the robot's pose and the lines around it.
+    """A local filter over the robot's pose and the lines around it.
 
     :ivar hypothesis: id of the hypothesis.
-    :ivar area: the current area; the map frame is its frame.
+    :ivar area: the current area, whose frame is that of the map.
     :ivar line_map: the belief.
     :ivar keyframes: the local map's keyframes, ids.
     :ivar keyframe_areas: their areas.
@@ -182,7 +167,7 @@ class LineFilter:
 
     @property
     def state(self) -> LineFilterState:
-        """All that is remembered."""
+        """The state of the filter."""
         return LineFilterState(
             self.hypothesis,
             self.area,
@@ -204,7 +189,7 @@ class LineFilter:
 
     @property
     def poses(self) -> Float64:
-        """The mean alone, shape (1, 3)."""
+        """The mean pose as a single particle, shape (1, 3)."""
         return self.pose[None]
 
     def leading_keyframe_poses(self) -> Float64:
@@ -218,10 +203,10 @@ class LineFilter:
         return child
 
     def release(self) -> None:
-        """There is nothing to give back."""
+        """Do nothing: a line filter holds no shared resources."""
 
     def initialize(self, pose: PoseGaussian) -> None:
-        """The robot stands at ``map_T_base``, known so well, and is predicted from there."""
+        """Set the belief over ``map_T_base``, and restart the prediction."""
         self.line_map.reset_pose(pose)
         self.tracking_covariance = np.zeros((3, 3))
         self._restart_prediction()
@@ -229,44 +214,43 @@ class LineFilter:
     def track(self, prepared: PreparedScan, prediction: Prediction) -> TrackedMotion:
         """Predict and correct by the scan's lines."""
         before, lines = self.pose, prepared.derived(lines_of_scan)
-        believed, contradicted = self._most_likely_posterior(lines, prediction)
-        self.line_map = believed.line_map
-        self._motion_since_update = self._motion_since_update.compose(believed.motion)
-        self._information = _line_information(lines, believed.associations)
+        posterior, contradicted = self._most_likely_posterior(lines, prediction)
+        self.line_map = posterior.line_map
+        self._motion_since_update = self._motion_since_update.compose(posterior.motion)
+        self._information = _line_information(lines, posterior.associations)
         self.tracking_covariance = matrix_inverse(
             matrix_inverse(self._motion_since_update.covariance) + self._information
         )
         return TrackedMotion(se2.between(before, self.pose), self._information, contradicted)
 
     def _most_likely_posterior(self, lines: Lines, prediction: Prediction) -> tuple[_MapPosterior, bool]:
-        """After the scan, and whether odometry is not believed: by inertia more of the scan's lines are known."""
+        """The map after the scan, and whether odometry is rejected: whether more lines match by inertia."""
         if prediction.odometry is None:
             return self._posterior(lines, prediction.inertia), False
         by_odometry = self._posterior(lines, prediction.fused)
-        known = len(by_odometry.associations.matched)
-        if known >= _MIN_MATCHED_SHARE * len(lines):
+        matched = len(by_odometry.associations.matched)
+        if matched >= _MIN_MATCHED_SHARE * len(lines):
             return by_odometry, False
         by_inertia = self._posterior(lines, prediction.inertia)
-        contradicted = len(by_inertia.associations.matched) > known
+        contradicted = len(by_inertia.associations.matched) > matched
         return (by_inertia if contradicted else by_odometry), contradicted
 
     def _posterior(self, lines: Lines, step: RelativeMotion) -> _MapPosterior:
-        room = LineMap.from_state(self.mapping.configuration.features, self.line_map.state)
-        room.predict(step)
-        return _MapPosterior(room, step, room.observe(lines))
+        line_map = LineMap.from_state(self.mapping.configuration.features, self.line_map.state)
+        line_map.predict(step)
+        return _MapPosterior(line_map, step, line_map.observe(lines))
 
-    def update(self, prepared: PreparedScan, step: int) -> FilterStep:  # noqa: ARG002  it was tracked; nothing is drawn
-        """What the scans since the last keyframe came to."""
-        here = self.line_map.pose
-        moved = se2.between(self.line_map.clones.poses[0], here.mean)
+    def update(self, prepared: PreparedScan, step: int) -> FilterStep:  # noqa: ARG002  tracked already; nothing is drawn
+        """The motion since the last keyframe, with its error."""
+        pose = self.line_map.pose
+        moved = se2.between(self.line_map.clones.poses[0], pose.mean)
         matched = matrix_inverse(matrix_inverse(self._motion_since_update.covariance) + self._information)
-        # What the pose in the area's frame became less certain by.
-        lasting = _positive_part(here.covariance - propagate_covariance(self._last_covariance, moved))
+        # The growth of the pose's covariance in the area's frame.
+        lasting = _positive_part(pose.covariance - propagate_covariance(self._last_covariance, moved))
         error = MatchError(matched, lasting, matched @ self._information)
         self._restart_prediction()
-        corrected = bool(
-            np.any(np.hypot(*(self.leading_keyframe_poses() - self._reported_poses)[:, :2].T) > _MIN_CORRECTION)
-        )
+        corrections = np.hypot(*(self.leading_keyframe_poses() - self._reported_poses)[:, :2].T)
+        corrected = bool(np.any(corrections > _MIN_CORRECTION))
         if corrected:
             self._reported_poses = self.leading_keyframe_poses()
         return FilterStep(moved, error, self._information, 1.0, corrected)
@@ -278,17 +262,18 @@ class LineFilter:
         self.line_map.clones = self.line_map.clones.select([count - 1, *range(1, count - 1)])
 
     def compare_scan(self, prepared: PreparedScan) -> MapAgreement:
-        """A scan in the map: what passes walls contradicts it."""
+        """Agreement of a scan with the map: beams that pass walls contradict it."""
         near = self.mapping.configuration.matching.matched_distance
         ends = se2.transform(self.pose, prepared.surfels[:, :2])
-        found = count_beams_at_walls(
-            ends, se2.transform(self.pose, prepared.laser_position[None])[0], self.line_map, near
-        )
-        walls = Agreement(found.samples_hit + found.samples_passed, found.samples_hit, found.samples_passed)
-        return MapAgreement(Agreement(len(ends), found.beams_ending, found.beams_passing), walls)
+        laser = se2.transform(self.pose, prepared.laser_position[None])[0]
+        lines = zip(self.line_map.lines, self.line_map.walls, strict=True)
+        rows = [(*line, *segment) for line, wall in lines for segment in wall.segments]
+        segments = np.array(rows, dtype=np.float64).reshape(-1, 4)
+        ending, passing, hit, passed = _count_beams(ends, laser, segments, near)
+        return MapAgreement(Agreement(len(ends), ending, passing), Agreement(hit + passed, hit, passed))
 
     def add_keyframe(self, keyframe: int, scan: Scan) -> None:
-        """Note where a scan was taken; with the first one the map begins."""
+        """Add a keyframe at the robot's pose; the first one begins the map."""
         if not self.keyframes:
             self.line_map.observe(extract_for_map(scan, self.mapping.configuration.features), keep_new=True)
         self.keyframes.append(keyframe)
@@ -297,7 +282,7 @@ class LineFilter:
         self._reported_poses = np.concatenate((self._reported_poses, self.poses))
 
     def drop_keyframes(self, keyframes: Collection[int]) -> None:
-        """Forget keyframes, but not what the map holds of them."""
+        """Remove keyframes, but not their lines."""
         kept = [k for k, keyframe in enumerate(self.keyframes) if keyframe not in keyframes]
         self.keyframes = [self.keyframes[k] for k in kept]
         self.keyframe_areas = [self.keyframe_areas[k] for k in kept]
@@ -305,9 +290,9 @@ class LineFilter:
         self._reported_poses = self._reported_poses[kept]
 
     def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
-        """Go over to the frame of another area and load its local map.
+        """Change to the frame of another area, and load its local map.
 
-        :param area: the area now.
+        :param area: the new area.
         :param area_T_previous: shape (3,).
         :param content: all keyframes of the local map, in the new frame.
         """
@@ -315,27 +300,27 @@ class LineFilter:
         self._load_submap(content, area_T_previous)
 
     def reload(self, content: Sequence[PlacedKeyframe], anchor: int) -> None:
-        """Build the local map anew after its keyframes moved; the robot stays where it is from one of them.
+        """Rebuild the local map after its keyframes moved; the robot keeps its pose relative to one of them.
 
         :param content: all keyframes of the local map.
-        :param anchor: the keyframe by which the robot's place is known.
+        :param anchor: the keyframe relative to which the robot's pose is known.
         """
         before = self.leading_keyframe_poses()[self.keyframes.index(anchor)]
         after = next(placed.pose for placed in content if placed.keyframe == anchor)
         self._load_submap(content, se2.compose(after, se2.inverse(before)))
 
     def _load_submap(self, content: Sequence[PlacedKeyframe], moved: Float64) -> None:
-        """Make the map of the lines that keyframes show, and put the robot into it.
+        """Build the map of keyframes, and put the robot into it.
 
         :param moved: ``new_T_old`` of the map frame, shape (3,).
         """
-        here, last = (se2.compose(moved, pose) for pose in (self.pose, self.line_map.clones.poses[0]))
+        pose, last = (se2.compose(moved, old) for old in (self.pose, self.line_map.clones.poses[0]))
         features = self.mapping.configuration.features
         self.line_map = LineMap(features)
         for placed in content:
             self.line_map.reset_pose(PoseGaussian(placed.pose, _KEYFRAME_COVARIANCE))
             self.line_map.observe(extract_for_map(placed.scan, features), keep_new=True)
-        self.line_map.reset_pose(PoseGaussian(here, _KEYFRAME_COVARIANCE))
+        self.line_map.reset_pose(PoseGaussian(pose, _KEYFRAME_COVARIANCE))
         self._last_covariance = _KEYFRAME_COVARIANCE
         self.keyframes = [placed.keyframe for placed in content]
         self.keyframe_areas = [placed.area for placed in content]
@@ -345,18 +330,68 @@ class LineFilter:
         )
 
 
-def _line_information(lines: Lines, observed: LineAssociations) -> Float64:
-    """Information of the lines that were known about the motion to their scan, in the robot's frame, shape (3, 3)."""
-    told = np.zeros((3, 3))
-    for k, _ in observed.matched:
+def _line_information(lines: Lines, associations: LineAssociations) -> Float64:
+    """Information of the matched lines about the motion to their scan, in the robot's frame, shape (3, 3)."""
+    information = np.zeros((3, 3))
+    for k, _ in associations.matched:
         alpha = float(lines.parameters[k, 0])
-        slopes = np.array([[0.0, 0.0, -1.0], [-math.cos(alpha), -math.sin(alpha), 0.0]])
-        told += slopes.T @ np.linalg.solve(lines.covariances[k], slopes)
-    return told
+        jacobian = np.array([[0.0, 0.0, -1.0], [-math.cos(alpha), -math.sin(alpha), 0.0]])
+        information += jacobian.T @ np.linalg.solve(lines.covariances[k], jacobian)
+    return information
 
 
 def _positive_part(matrix: Float64) -> Float64:
-    """The part of a symmetric matrix that is a covariance."""
+    """The positive semidefinite part of a symmetric matrix."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     found: Float64 = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return found
+
+
+class FilterSelector:
+    """Filter factory for ``local_map.kind``; "by_class" is after Tomatis et al. (2003), section 3.1."""
+
+    def __init__(self, mapping: LocalMapping) -> None:
+        self._mapping = mapping
+        self._kind = mapping.configuration.local_map.kind
+        self._classifier = AreaClassifier(mapping)
+
+    def new(self, hypothesis: int, area: int) -> LocalFilter:
+        """An empty filter; by class, one with a grid."""
+        kind = LineFilter if self._kind == "lines" else ParticleFilter
+        return kind(self._mapping, hypothesis, area)
+
+    def restore(self, state: ParticleFilterState | LineFilterState) -> LocalFilter:
+        """The filter of a state; patches of grids are in the pool."""
+        if isinstance(state, LineFilterState):
+            return LineFilter.from_state(self._mapping, state)
+        return ParticleFilter.from_state(self._mapping, state)
+
+    def select(self, own: LocalFilter, area: int, content: Sequence[PlacedKeyframe]) -> LocalFilter:
+        """The filter for an area: ``own``, or an empty one of another kind with the same pose.
+
+        ``own`` is released in the latter case.
+
+        :param area: the entered one.
+        :param content: keyframes in its frame; those of the area determine its class.
+        """
+        if self._kind != "by_class":
+            return own
+        kind = self._filter_type(area, content)
+        if kind is None or isinstance(own, kind):
+            return own
+        other = kind(self._mapping, own.hypothesis, own.area)
+        other.initialize(PoseGaussian.from_pose(own.pose))
+        other.tracking_covariance, other.clutter_estimate = own.tracking_covariance, own.clutter_estimate
+        own.release()
+        return other
+
+    def _filter_type(
+        self, area: int, content: Sequence[PlacedKeyframe]
+    ) -> type[ParticleFilter] | type[LineFilter] | None:
+        """The filter type for the class of an area; None where too little is known."""
+        keyframes = [placed for placed in content if placed.area == area]
+        poses = np.array([placed.pose for placed in keyframes]).reshape(-1, 3)
+        area_class = self._classifier.classify([placed.scan for placed in keyframes], poses)
+        if area_class is None:
+            return None
+        return ParticleFilter if area_class.is_hallway else LineFilter

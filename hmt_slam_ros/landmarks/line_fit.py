@@ -1,9 +1,9 @@
-"""The line through some beams with its covariance (Arras and Siegwart 1997), and which segments are one line.
+"""Line fit with covariance (Arras and Siegwart 1997), and merging of segments of one line.
 
-A line is n(alpha) p = r. A beam from o along the unit vector d meets it at the range (r - n o) / (n d). The ranges are
-uncertain and the directions exact, so that an error of a range is n d times as large across the line, and the weight of
-a point 1 / (sigma n d)^2: least squares over the ranges, by Gauss-Newton. Weights that do not depend on n d would lose
-most of what grazed walls say, and turn them.
+A line is n(alpha) p = r. A beam from o along the unit vector d meets it at the range (r - n o) / (n d). Ranges are
+uncertain and directions exact. So an error of a range is n d times as large across the line, and the weight of a point
+is 1 / (sigma n d)^2: least squares over the ranges, by Gauss-Newton. Other weights would lose most information of walls
+at grazing angles, and rotate them.
 """
 
 from __future__ import annotations
@@ -18,8 +18,13 @@ from hmt_slam_ros.arrays import Float64, Int32
 from hmt_slam_ros.geometry.se2 import wrap_by_turns
 
 _STEPS = 6
-_PARALLEL = 1e-4  # a beam along the line says nothing of it
+"""Gauss-Newton steps."""
+
+_PARALLEL = 1e-4
+"""Beams with a smaller sine of the angle to the line are ignored."""
+
 _SMALL = 1e-12
+"""Relative determinant of the information below which there is no line."""
 
 
 class Beams(NamedTuple):
@@ -42,7 +47,7 @@ def fit_line(beams: Beams, labels: Int32, line: int, fitted: Float64) -> int:
     :param labels: shape (n,).
     :param line: the label.
     :param fitted: shape (5,), written to: alpha in [-pi, pi), r >= 0, and var(alpha), cov(alpha, r), var(r); rad, m.
-    :returns: number of beams; below 2, or where they lie in one point, nothing is written.
+    :returns: number of beams; below 2, or for beams of one point, nothing is written.
     """
     points, directions = beams.points, beams.directions
     count, alpha, r = _initial_line(points, labels, line)
@@ -56,7 +61,7 @@ def fit_line(beams: Beams, labels: Int32, line: int, fitted: Float64) -> int:
             facing = cos * directions[k, 0] + sin * directions[k, 1]
             if labels[k] != line or abs(facing) < _PARALLEL:
                 continue
-            # Residual of the range, and the derivatives of the range by alpha and r where the beam meets the line.
+            # Residual of the range, and its derivatives by alpha and r.
             residual = (cos * points[k, 0] + sin * points[k, 1] - r) / facing
             x, y = points[k, 0] - residual * directions[k, 0], points[k, 1] - residual * directions[k, 1]
             weight = 1.0 / beams.deviations[k]
@@ -85,9 +90,9 @@ def write_normalized(alpha: float, r: float, aa: float, ar: float, rr: float, li
 
 @njit(cache=True)
 def variance_at(aa: float, ar: float, rr: float, along: float) -> float:
-    """Variance, m^2, of the distance of a point on a line from it, by var(alpha), cov(alpha, r) and var(r).
+    """Variance of the distance between a line and a point on it, by var(alpha), cov(alpha, r) and var(r), m^2.
 
-    :param along: where on the line the point is, m from the foot of the perpendicular.
+    :param along: position of the point on the line, m from the foot of the perpendicular.
     """
     return along * along * aa - 2.0 * along * ar + rr
 
@@ -111,10 +116,10 @@ def _initial_line(points: Float64, labels: Int32, line: int) -> tuple[int, float
 
 
 class MergeGate(NamedTuple):
-    """When two segments are one line.
+    """Thresholds for merging two segments into one line.
 
-    :ivar distance2: squared Mahalanobis distance at most.
-    :ivar deviation: of the distance of one's middle from the other at most, m.
+    :ivar distance2: largest squared Mahalanobis distance.
+    :ivar deviation: largest deviation of the distance of one's middle from the other, m.
     """
 
     distance2: float
@@ -123,7 +128,7 @@ class MergeGate(NamedTuple):
 
 @njit(cache=True)
 def relabel(labels: Int32, old: int, new: int) -> None:
-    """Give the beams of one line to another."""
+    """Replace a label."""
     for k in range(len(labels)):
         if labels[k] == old:
             labels[k] = new
@@ -131,7 +136,7 @@ def relabel(labels: Int32, old: int, new: int) -> None:
 
 @njit(cache=True)
 def merge_lines(beams: Beams, labels: Int32, lines: Float64, count: int, gate: MergeGate) -> int:
-    """Join those two lines that differ least, as long as the gate allows; return how many are left."""
+    """Merge the two most similar lines while the gate admits it, and return the number of lines."""
     middles = np.empty((count, 2))
     for line in range(count):
         _write_mean_point(beams.points, labels, line, middles[line])
@@ -165,10 +170,9 @@ def _write_mean_point(points: Float64, labels: Int32, line: int, middle: Float64
 
 @njit(cache=True)
 def _mutual_variance(a: Float64, middle_a: Float64, b: Float64, middle_b: Float64) -> float:
-    """How well two lines tell that they are one: variance, m^2, of the distance of the one's middle from the other.
+    """Variance of the distance of one line's middle from the other, m^2.
 
-    Of two short pieces far from each other that lie side by side, either could point at the other; that the one is
-    where the other points to says something only where it would not be so by chance.
+    If it is large, as for two short segments far apart, two lines may match by chance.
     """
     return min(
         _variance_at(a, middle_b) + _variance_at(b, middle_b), _variance_at(a, middle_a) + _variance_at(b, middle_a)
@@ -177,7 +181,7 @@ def _mutual_variance(a: Float64, middle_a: Float64, b: Float64, middle_b: Float6
 
 @njit(cache=True)
 def _variance_at(line: Float64, point: Float64) -> float:
-    """Variance, m^2, of the distance of a point (2,) near a line (5,) from it."""
+    """Variance of the distance between a point (2,) and a line (5,), m^2."""
     along = math.cos(line[0]) * point[1] - math.sin(line[0]) * point[0]
     return variance_at(line[2], line[3], line[4], along)
 
@@ -186,7 +190,7 @@ def _variance_at(line: Float64, point: Float64) -> float:
 def line_distance2(a: Float64, b: Float64) -> float:
     """Squared Mahalanobis distance of two independent lines (5,); chi-square with 2 degrees of freedom.
 
-    The second is taken in that of its two representations, (alpha, r) and (alpha + pi, -r), whose angle is nearer.
+    The second is taken in the nearer one of its representations (alpha, r) and (alpha + pi, -r).
     """
     turn = wrap_by_turns(b[0] - a[0])
     away, sign = b[1] - a[1], 1.0

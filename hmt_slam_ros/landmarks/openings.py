@@ -1,15 +1,13 @@
-"""Openings: gaps in a wall through which a scan sees free space, such as doors and crossing hallways.
+"""Openings: gaps in a wall with free space behind them, such as doors and crossing hallways.
 
-People, and furniture in the room behind a door, cross the line of a wall as well. The support of a jamb is the length
-of the stretch of wall that ends there; what crosses gives none, however long it is.
+Tomatis, Nourbakhsh and Siegwart (2003), section 2.1: large steps across a wall. Each beam ends before the line of a
+wall, on it, or behind it, and there shallow or deeper than a niche. Beams behind the line between two jambs are an
+opening if some of them are deep. A jamb is an end of the wall, or another wall that crosses its line, as at the mouth
+of a hallway; one of the two jambs is an end. The support of a jamb is the length of the wall that ends there; crossing
+surfaces, such as people and furniture, have none.
 
-Tomatis, Nourbakhsh and Siegwart (2003), section 2.1: large steps across a wall. A beam ends before the line of a wall,
-on it, or passes it, by a little or by more than a niche is deep. The beams that pass a line between two jambs are an
-opening where some of them go deep. A jamb is an end of the wall, or another wall that crosses its line, as at the end
-of a hallway that another one leaves to the side; one of the two is an end of the wall.
-
-Furniture has ends, too, and so have people who stand in an opening. The log-odds of an opening are linear in the
-logarithms of what was seen of its wall, of its jambs, and of what is behind it.
+The log-odds of an opening are linear in the logarithms of the visible length of the wall, of the supports of its jambs,
+and of the free share of its width.
 """
 
 from __future__ import annotations
@@ -20,75 +18,171 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.arrays import Float64, Int8, Int64
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.landmarks.beam_labels import (
-    DEEP_BEHIND,
-    ON_LINE,
-    STRAY_DEVIATIONS,
-    BeamLabels,
-    Rays,
-    deviation_across,
-    empty_beam_labels,
-    label_beams,
-    last_beam_behind,
-)
 from hmt_slam_ros.landmarks.line_extraction import Lines
 from hmt_slam_ros.landmarks.line_fit import variance_at
+from hmt_slam_ros.landmarks.rays import Rays
+
+NO_INFORMATION, ON_LINE, SHALLOW_BEHIND, DEEP_BEHIND, IN_FRONT = range(5)
+"""Labels of a beam relative to a line."""
+
+STRAY_DEVIATIONS = 3.5
+"""Largest distance between a line and the end of a beam on it, in deviations."""
+
+_MAX_LINE_DEVIATION = 0.06
+"""Largest deviation of a line where a beam meets it, m."""
+
+_MIN_SINE = 0.05
+"""Smallest sine of the angle between a beam and a line."""
+
+_MIN_DEEP_BEAMS = 3
+"""Smallest number of deep beams of an opening."""
+
+_MIN_SUPPORT, _MIN_SHARE = 0.1, 0.01
+"""Lower bounds of the support of a jamb, m, and of the free share, in the log-odds."""
+
+_SAME_DISTANCE, _SAME_HEADING = 0.6, 0.5
+"""Openings nearer to each other than this, m and rad, are one, as on both faces of a wall."""
+
+
+class BeamLabels(NamedTuple):
+    """Labels of beams relative to a line, in the order of bearing.
+
+    :ivar kinds: shape (n,), one of the constants above.
+    :ivar along: shape (n,), position on the line where they meet it, m.
+    :ivar behind: shape (n,), distance of their ends behind it, m.
+    :ivar beams: shape (n,), their numbers.
+    """
+
+    kinds: Int8
+    along: Float64
+    behind: Float64
+    beams: Int64
+
+
+@njit(cache=True)
+def empty_beam_labels(beams: int) -> BeamLabels:
+    """Uninitialized labels for some beams."""
+    return BeamLabels(np.empty(beams, np.int8), np.empty(beams), np.empty(beams), np.empty(beams, np.int64))
+
+
+@njit(cache=True)
+def label_beams(line: Float64, covariance: Float64, rays: Rays, depth: float, labels: BeamLabels) -> int:
+    """Write the labels of beams that are informative about a line, and return their number."""
+    cos, sin = math.cos(line[0]), math.sin(line[0])
+    beams, count, start, least = len(rays.free_range), 0, 0, 0.0
+    for k in range(beams):
+        facing = cos * rays.directions[k, 0] + sin * rays.directions[k, 1]
+        if facing < least:
+            start, least = k, facing
+    for n in range(beams):
+        k = (start + n) % beams
+        facing = cos * rays.directions[k, 0] + sin * rays.directions[k, 1]
+        if facing < _MIN_SINE:
+            continue
+        x, y = rays.origins[k, 0], rays.origins[k, 1]
+        distance = (line[1] - cos * x - sin * y) / facing
+        along = cos * (y + distance * rays.directions[k, 1]) - sin * (x + distance * rays.directions[k, 0])
+        behind = (rays.free_range[k] - distance) * facing
+        variance = variance_at(covariance[0, 0], covariance[0, 1], covariance[1, 1], along)
+        near = STRAY_DEVIATIONS * math.sqrt(variance + (rays.deviations[k] * facing) ** 2)
+        kind = _label_beam(behind, near, rays.hit[k], depth)
+        if variance <= _MAX_LINE_DEVIATION * _MAX_LINE_DEVIATION and kind != NO_INFORMATION:
+            labels.kinds[count], labels.along[count], labels.behind[count], labels.beams[count] = (
+                kind,
+                along,
+                behind,
+                k,
+            )
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _label_beam(behind: float, near: float, met: bool, depth: float) -> int:
+    """Label of a beam that ends ``behind`` a line, m; within ``near`` it is on the line."""
+    if behind >= depth:
+        return DEEP_BEHIND
+    if not met:
+        return NO_INFORMATION
+    if behind > near:
+        return SHALLOW_BEHIND
+    return ON_LINE if behind >= -near else IN_FRONT
+
+
+@njit(cache=True)
+def last_beam_behind(labels: BeamLabels, first: int, end: int) -> int:
+    """Last of the consecutive beams behind the line from ``first`` on; ``first - 1`` for none."""
+    last = first - 1
+    while last + 1 < end and (labels.kinds[last + 1] == SHALLOW_BEHIND or labels.kinds[last + 1] == DEEP_BEHIND):
+        last += 1
+    return last
+
+
+@njit(cache=True)
+def deviation_across(line: Float64, rays: Rays, beam: int) -> float:
+    """Deviation of the end of a beam across a line, m."""
+    facing = math.cos(line[0]) * rays.directions[beam, 0] + math.sin(line[0]) * rays.directions[beam, 1]
+    return rays.deviations[beam] * facing
+
 
 POSITION, VARIANCE, SUPPORT = range(3)
-"""Where what is known of a jamb stands in an array: where on the line, m, the variance of that, and support, m."""
+"""Columns of a jamb: its position on the line, m, the variance of that, m^2, and its support, m."""
+
+# Columns of a gap: its line, the first jamb, the last one, and the free share.
+_LINE, _FIRST, _LAST, _SHARE, _SIZE = 0, 1, 4, 7, 8
 
 
 @njit(cache=True)
 def write_wall_end_jamb(
-    line: Float64, covariance: Float64, rays: Rays, told: BeamLabels, k: int, step: int, max_gap: float, jamb: Float64
+    line: Float64, covariance: Float64, rays: Rays, labels: BeamLabels, k: int, step: int, max_gap: float, jamb: Float64
 ) -> None:
-    """Write the jamb where the wall ends on which the beams from ``k`` on lie, away from the gap.
+    """Write the jamb at the end of the wall on which the beams from ``k`` on end, away from the gap.
 
-    The first of them may lie on its other side, in the thickness of the wall.
+    The first of them may end on the side of the jamb, in the thickness of the wall.
 
-    :param told: what beams say of the line, all of those that say something.
+    :param labels: of the informative beams.
     """
-    end = len(told.labels)
+    end = len(labels.kinds)
     while (
         0 <= k + step < end
-        and told.labels[k + step] == ON_LINE
-        and told.behind[k] > deviation_across(line, rays, told.beams[k])
+        and labels.kinds[k + step] == ON_LINE
+        and labels.behind[k] > deviation_across(line, rays, labels.beams[k])
     ):
         k += step
-    spacing, beam = told.along[k - step] - told.along[k], told.beams[k]
-    jamb[POSITION] = told.along[k] + 0.5 * spacing
-    # Where the end is between two beams, and how far the line's error moves it along the beam.
+    spacing, beam = labels.along[k - step] - labels.along[k], labels.beams[k]
+    jamb[POSITION] = labels.along[k] + 0.5 * spacing
+    # The end is between two beams, and an error of the line moves it along the beam.
     facing = math.cos(line[0]) * rays.directions[beam, 0] + math.sin(line[0]) * rays.directions[beam, 1]
     slant = (1.0 - facing * facing) / (facing * facing)
     uncertain = abs(spacing) + 2.0 * STRAY_DEVIATIONS * rays.deviations[beam]
     jamb[VARIANCE] = uncertain * uncertain / 12.0
-    jamb[VARIANCE] += slant * variance_at(covariance[0, 0], covariance[0, 1], covariance[1, 1], told.along[k])
+    jamb[VARIANCE] += slant * variance_at(covariance[0, 0], covariance[0, 1], covariance[1, 1], labels.along[k])
     last = k
-    while 0 <= last + step < end and told.labels[last + step] == ON_LINE:
-        if abs(told.along[last + step] - told.along[last]) > max_gap:
+    while 0 <= last + step < end and labels.kinds[last + step] == ON_LINE:
+        if abs(labels.along[last + step] - labels.along[last]) > max_gap:
             break
         last += step
-    jamb[SUPPORT] = abs(told.along[last] - told.along[k])
+    jamb[SUPPORT] = abs(labels.along[last] - labels.along[k])
 
 
 @njit(cache=True)
 def write_crossing_wall_jamb(
-    line: Float64, rays: Rays, told: BeamLabels, k: int, step: int, max_gap: float, jamb: Float64
+    line: Float64, rays: Rays, labels: BeamLabels, k: int, step: int, max_gap: float, jamb: Float64
 ) -> bool:
-    """Write the jamb where another wall crosses the line before beam ``k``; False where none does."""
-    before = told.beams[k - step]
-    x, y = _beam_end(rays, told.beams[k])
+    """Write the jamb where another wall crosses the line before beam ``k``; False for none."""
+    before = labels.beams[k - step]
+    x, y = _beam_end(rays, labels.beams[k])
     from_x, from_y = _beam_end(rays, before)
     if not rays.hit[before] or math.hypot(x - from_x, y - from_y) > max_gap:
         return False
     cos, sin = math.cos(line[0]), math.sin(line[0])
-    share = told.behind[k - step] / (told.behind[k - step] - told.behind[k])
+    share = labels.behind[k - step] / (labels.behind[k - step] - labels.behind[k])
     crossing_x, crossing_y = from_x + share * (x - from_x), from_y + share * (y - from_y)
     jamb[POSITION] = cos * crossing_y - sin * crossing_x
-    beam = told.beams[k]
+    beam = labels.beams[k]
     slanted = cos * rays.directions[beam, 1] - sin * rays.directions[beam, 0]
     jamb[VARIANCE] = (rays.deviations[beam] * slanted) ** 2
     jamb[SUPPORT] = 0.0
@@ -97,21 +191,10 @@ def write_crossing_wall_jamb(
 
 @njit(cache=True)
 def _beam_end(rays: Rays, beam: int) -> tuple[float, float]:
-    """Where a beam ends."""
+    """End point of a beam, m."""
     away = rays.free_range[beam]
     x = rays.origins[beam, 0] + away * rays.directions[beam, 0]
     return x, rays.origins[beam, 1] + away * rays.directions[beam, 1]
-
-
-# Beams that go deep, at least.
-_BEAMS = 3
-# A jamb with less support, m, and a lesser share that is seen through count as this much.
-_LEAST_JAMB, _LEAST_SHARE = 0.1, 0.01
-# Two openings this near to each other (m, rad) are one, seen in both faces of a wall.
-_SAME, _SAME_HEADING = 0.6, 0.5
-
-# Columns of a gap that was found: its line, the first jamb, the last one, and the share that is seen through.
-_LINE, _FIRST, _LAST, _SHARE, _SIZE = 0, 1, 4, 7, 8
 
 
 class Openings(NamedTuple):
@@ -132,7 +215,7 @@ class Openings(NamedTuple):
 
 
 NO_OPENINGS = Openings(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0), np.empty(0), np.empty(0))
-"""What a scan shows before the first one."""
+"""No openings, before the first scan."""
 
 
 def extract_openings(lines: Lines, rays: Rays, features: FeatureParameters) -> Openings:
@@ -141,50 +224,50 @@ def extract_openings(lines: Lines, rays: Rays, features: FeatureParameters) -> O
 
 
 def extract_openings_with_evidence(lines: Lines, rays: Rays, features: FeatureParameters) -> tuple[Openings, Float64]:
-    """The openings, and what their confidences follow from.
+    """The openings, and the evidence of their confidences.
 
-    :returns: the second of shape (n, 3), logarithms of what was seen of the wall, m, of both jambs, m, together, and of
-        the share of the width that is seen through.
+    :returns: the second of shape (n, 3), logarithms of the visible length of the wall, m, of the supports of both
+        jambs, m, added, and of the free share of the width.
     """
     parameters = np.ascontiguousarray(lines.parameters)
-    found = _select_openings(parameters, lines.covariances, rays, features.opening_depth, features.max_gap)
-    widths = found[:, _LAST] - found[:, _FIRST]
-    found = found[(widths >= features.opening_min) & (widths <= features.opening_max)]
-    own = found[:, _LINE].astype(np.int64)
+    gaps = _select_openings(parameters, lines.covariances, rays, features.opening_depth, features.max_gap)
+    widths = gaps[:, _LAST] - gaps[:, _FIRST]
+    gaps = gaps[(widths >= features.opening_min) & (widths <= features.opening_max)]
+    own = gaps[:, _LINE].astype(np.int64)
     alpha, r = lines.parameters[own].T
-    middles = 0.5 * (found[:, _FIRST] + found[:, _LAST])
-    variances = found[:, _FIRST + VARIANCE] + found[:, _LAST + VARIANCE]
+    middles = 0.5 * (gaps[:, _FIRST] + gaps[:, _LAST])
+    variances = gaps[:, _FIRST + VARIANCE] + gaps[:, _LAST + VARIANCE]
     cos, sin = np.cos(alpha), np.sin(alpha)
     poses = np.stack((r * cos - middles * sin, r * sin + middles * cos, alpha), axis=1)
-    # In the frame of the opening: r moves it ahead, and alpha turns it about the origin.
-    by_line = np.zeros((len(found), 3, 2))
+    # In the frame of the opening: r moves it ahead, and alpha rotates it about the origin.
+    by_line = np.zeros((len(gaps), 3, 2))
     by_line[:, 0, 0], by_line[:, 0, 1], by_line[:, 1, 0], by_line[:, 2, 0] = -middles, 1.0, r, 1.0
     covariances = by_line @ lines.covariances[own] @ by_line.transpose(0, 2, 1)
     covariances[:, 1, 1] += 0.25 * variances
-    evidence = _evidence(found, lines)
+    evidence = _evidence(gaps, lines)
     weights = np.array([features.opening_wall, features.opening_jambs, features.opening_share])
     confidences = 1.0 / (1.0 + np.exp(-features.opening_bias - evidence @ weights))
-    widths = found[:, _LAST] - found[:, _FIRST]
-    every = Openings(poses, covariances, widths, np.sqrt(variances), confidences)
-    kept = _distinct_openings(every)
-    return Openings(*(field[kept] for field in every)), evidence[kept]
+    widths = gaps[:, _LAST] - gaps[:, _FIRST]
+    openings = Openings(poses, covariances, widths, np.sqrt(variances), confidences)
+    kept = _distinct_openings(openings)
+    return Openings(*(field[kept] for field in openings)), evidence[kept]
 
 
-def _evidence(found: Float64, lines: Lines) -> Float64:
-    """What speaks for gaps (n, 8) being openings, shape (n, 3)."""
-    seen = np.zeros(len(lines))
-    np.add.at(seen, lines.owners, lines.segments[:, 1] - lines.segments[:, 0])
-    walls = np.log(seen[found[:, _LINE].astype(np.int64)])
-    jambs = np.log(np.maximum(found[:, [_FIRST + SUPPORT, _LAST + SUPPORT]], _LEAST_JAMB)).sum(axis=1)
-    shares = np.log(np.maximum(found[:, _SHARE], _LEAST_SHARE))
+def _evidence(gaps: Float64, lines: Lines) -> Float64:
+    """Evidence for gaps (n, 8), shape (n, 3), as of `extract_openings_with_evidence`."""
+    lengths = np.zeros(len(lines))
+    np.add.at(lengths, lines.owners, lines.segments[:, 1] - lines.segments[:, 0])
+    walls = np.log(lengths[gaps[:, _LINE].astype(np.int64)])
+    jambs = np.log(np.maximum(gaps[:, [_FIRST + SUPPORT, _LAST + SUPPORT]], _MIN_SUPPORT)).sum(axis=1)
+    shares = np.log(np.maximum(gaps[:, _SHARE], _MIN_SHARE))
     return np.stack((walls, jambs, shares), axis=1)
 
 
 def _distinct_openings(openings: Openings) -> list[int]:
-    """Numbers of those that are one the most confident to a tenth, and of these the one whose wall is known best."""
+    """Numbers of distinct openings: of duplicates the most confident, to a tenth, and of these the most accurate."""
     kept: list[int] = []
     for k in np.lexsort((openings.covariances[:, 0, 0], -np.round(openings.confidences, 1))).tolist():
-        near = np.hypot(*(openings.poses[kept, :2] - openings.poses[k, :2]).T) < _SAME
+        near = np.hypot(*(openings.poses[kept, :2] - openings.poses[k, :2]).T) < _SAME_DISTANCE
         turn = np.abs(se2.wrap(openings.poses[kept, 2] - openings.poses[k, 2]))
         if not np.any(near & (turn < _SAME_HEADING)):
             kept.append(k)
@@ -193,21 +276,21 @@ def _distinct_openings(openings: Openings) -> list[int]:
 
 @njit(cache=True)
 def _select_openings(lines: Float64, covariances: Float64, rays: Rays, depth: float, max_gap: float) -> Float64:
-    """All gaps between two jambs in the lines that beams go deep through, (n, 8)."""
+    """All gaps in lines between two jambs with deep beams, (n, 8)."""
     beams, count = len(rays.free_range), 0
-    found, room = np.empty((len(lines) * (beams // _BEAMS) + 1, _SIZE)), empty_beam_labels(beams)
+    gaps, buffer = np.empty((len(lines) * (beams // _MIN_DEEP_BEAMS) + 1, _SIZE)), empty_beam_labels(beams)
     for own in range(len(lines)):
-        last, end = -1, label_beams(lines[own], covariances[own], rays, depth, room)
-        told = BeamLabels(room.labels[:end], room.along[:end], room.behind[:end], room.beams[:end])
+        last, end = -1, label_beams(lines[own], covariances[own], rays, depth, buffer)
+        labels = BeamLabels(buffer.kinds[:end], buffer.along[:end], buffer.behind[:end], buffer.beams[:end])
         while last + 1 < end:
             first = last + 1
-            last = last_beam_behind(told, first, end)
+            last = last_beam_behind(labels, first, end)
             if last < first:
                 last = first
-            elif _write_gap(lines[own], covariances[own], rays, told, first, last, max_gap, found[count]):
-                found[count, _LINE] = own
+            elif _write_gap(lines[own], covariances[own], rays, labels, first, last, max_gap, gaps[count]):
+                gaps[count, _LINE] = own
                 count += 1
-    return found[:count]
+    return gaps[:count]
 
 
 @njit(cache=True)
@@ -215,31 +298,31 @@ def _write_gap(
     line: Float64,
     covariance: Float64,
     rays: Rays,
-    told: BeamLabels,
+    labels: BeamLabels,
     first: int,
     last: int,
     max_gap: float,
-    found: Float64,
+    gap: Float64,
 ) -> bool:
-    """Write the gap that beams from the first to the last pass; False where it is none."""
+    """Write the gap of the beams from the first to the last; False where it is no opening."""
     before, after = first - 1, last + 1
-    if before < 0 or after >= len(told.labels) or (told.labels[before] != ON_LINE and told.labels[after] != ON_LINE):
+    if before < 0 or after >= len(labels.kinds) or (labels.kinds[before] != ON_LINE and labels.kinds[after] != ON_LINE):
         return False
-    for beam, step, jamb in ((before, -1, found[_FIRST:_LAST]), (after, 1, found[_LAST:_SHARE])):
-        if told.labels[beam] == ON_LINE:
-            write_wall_end_jamb(line, covariance, rays, told, beam, step, max_gap, jamb)
-        elif not write_crossing_wall_jamb(line, rays, told, beam, step, max_gap, jamb):
+    for beam, step, jamb in ((before, -1, gap[_FIRST:_LAST]), (after, 1, gap[_LAST:_SHARE])):
+        if labels.kinds[beam] == ON_LINE:
+            write_wall_end_jamb(line, covariance, rays, labels, beam, step, max_gap, jamb)
+        elif not write_crossing_wall_jamb(line, rays, labels, beam, step, max_gap, jamb):
             return False
     deep, clear = 0, 0.0
     for k in range(first, last + 1):
-        if told.labels[k] == DEEP_BEHIND:
-            deep, clear = deep + 1, clear + 0.5 * abs(told.along[k + 1] - told.along[k - 1])
-    if found[_FIRST] > found[_LAST]:
+        if labels.kinds[k] == DEEP_BEHIND:
+            deep, clear = deep + 1, clear + 0.5 * abs(labels.along[k + 1] - labels.along[k - 1])
+    if gap[_FIRST] > gap[_LAST]:
         for column in range(_SHARE - _LAST):
             one, other = _FIRST + column, _LAST + column
-            found[one], found[other] = found[other], found[one]
-    found[_SHARE] = clear / max(found[_LAST] - found[_FIRST], clear)
-    return deep >= _BEAMS
+            gap[one], gap[other] = gap[other], gap[one]
+    gap[_SHARE] = clear / max(gap[_LAST] - gap[_FIRST], clear)
+    return deep >= _MIN_DEEP_BEAMS
 
 
 def jamb_positions(poses: Float64, widths: Float64) -> Float64:
@@ -253,18 +336,19 @@ def jamb_positions(poses: Float64, widths: Float64) -> Float64:
 
 
 def distance_to_doors(origins: Float64, directions: Float64, doors: Float64) -> Float64:
-    """How far it is along beams to the first door that they pass, m, shape (n,); inf where there is none.
+    """Distance along beams to the first door, m, shape (n,); inf for none.
 
-    :param origins: shape (n, 2), where beams begin, m.
+    :param origins: shape (n, 2), m.
     :param directions: shape (n, 2), unit vectors.
     :param doors: shape (k, 4), x and y of both jambs of each, m.
     """
     along = doors[None, :, 2:] - doors[None, :, :2]
-    to = doors[None, :, :2] - origins[:, None]
-    turned = _cross_product(directions[:, None], along)
-    turned = np.where(turned == 0.0, np.nan, turned)
-    away, share = _cross_product(to, along) / turned, _cross_product(to, directions[:, None]) / turned
-    passed = np.where((away > 0.0) & (share >= 0.0) & (share <= 1.0), away, np.inf)
+    offsets = doors[None, :, :2] - origins[:, None]
+    determinant = _cross_product(directions[:, None], along)
+    determinant = np.where(determinant == 0.0, np.nan, determinant)
+    distances = _cross_product(offsets, along) / determinant
+    shares = _cross_product(offsets, directions[:, None]) / determinant
+    passed = np.where((distances > 0.0) & (shares >= 0.0) & (shares <= 1.0), distances, np.inf)
     return np.asarray(passed.min(axis=1, initial=np.inf))
 
 

@@ -1,8 +1,7 @@
 """Portals: openings through which the robot's path passed from one area into another.
 
-What Tomatis, Nourbakhsh and Siegwart (2003), section 2.1, have as nodes of a graph, is an annotation of arcs here. An
-area ends where sensed space overlaps least (AAM), which may be a step or two beside the door; so the stretch of the
-path around the change of areas counts, and of the openings that it passes the one that is nearest to the change.
+They are the graph nodes of Tomatis, Nourbakhsh and Siegwart (2003), section 2.1; here they annotate arcs. An area may
+end a step or two beside its door. So of the openings on the path around the change of areas, the nearest one counts.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ class Portal:
     """An opening between two areas a < b.
 
     :ivar areas: a and b.
-    :ivar pose_in_a: the belief over ``a_T_portal``, the middle between the jambs, with the heading from a to b.
-    :ivar pose_in_b: the belief over ``b_T_portal``, likewise.
+    :ivar pose_in_a: belief over ``a_T_portal``, the middle between the jambs, with the heading from a to b.
+    :ivar pose_in_b: belief over ``b_T_portal``, likewise.
     :ivar width: m.
     :ivar width_deviation: of this, m.
-    :ivar existence: probability that it is there.
-    :ivar crossing_count: how often the path changes areas there.
+    :ivar existence: its probability.
+    :ivar crossing_count: changes of areas there.
     """
 
     areas: tuple[int, int]
@@ -63,21 +62,21 @@ def find_portals(
         if k is None:
             found.append(portal)
         else:
-            better = max(found[k], portal, key=lambda one: one.existence)
+            better = max(found[k], portal, key=lambda each: each.existence)
             found[k] = replace(better, crossing_count=found[k].crossing_count + 1)
     return tuple(sorted(found, key=lambda portal: portal.areas))
 
 
-def _is_same_portal(one: Portal, other: Portal) -> bool:
-    """Whether two portals are one, seen in both faces of a wall or at two passages."""
-    away = one.pose_in_a.mean[:2] - other.pose_in_a.mean[:2]
-    return one.areas == other.areas and float(np.hypot(*away)) < SAME_OPENING_DISTANCE
+def _is_same_portal(first: Portal, second: Portal) -> bool:
+    """Whether two portals are one, on both faces of a wall or at two crossings."""
+    offset = first.pose_in_a.mean[:2] - second.pose_in_a.mean[:2]
+    return first.areas == second.areas and float(np.hypot(*offset)) < SAME_OPENING_DISTANCE
 
 
 def _portals_along_path(
     hybrid_map: HybridMap, landmarks: Mapping[int, Sequence[Landmark]], features: FeatureParameters
 ) -> Iterator[Portal]:
-    """The portal at every change of areas along the path that passes one."""
+    """The portal of each change of areas on the path; none where no opening is passed."""
     poses = {area: hybrid_map.keyframes(area) for area in hybrid_map.area_ids()}
     own = {area: sorted(within) for area, within in poses.items()}
     path = sorted((keyframe, area) for area, within in own.items() for keyframe in within)
@@ -87,20 +86,20 @@ def _portals_along_path(
             continue
         back = (poses[left][k] for k in reversed(own[left][: bisect_left(own[left], keyframe)]))
         ahead = (se2.compose(arc.mean, poses[entered][k]) for k in own[entered][bisect_left(own[entered], keyframe) :])
-        ways = [_nearby_path(way, features) for way in (back, ahead)]
-        if np.hypot(*(ways[0][0] - ways[1][0])) <= MAX_STEP:
-            around = np.concatenate((ways[0][::-1], ways[1]))
-            yield from _nearest_portal(around, len(ways[0]) - 0.5, (left, entered), arc, landmarks)
+        before, after = (_nearby_path(poses_on_path, features) for poses_on_path in (back, ahead))
+        if np.hypot(*(before[0] - after[0])) <= MAX_STEP:
+            around = np.concatenate((before[::-1], after))
+            yield from _nearest_portal(around, len(before) - 0.5, (left, entered), arc, landmarks)
 
 
-def _nearby_path(way: Iterable[Float64], features: FeatureParameters) -> Float64:
-    """The places (n, 2) of a way of poses that are near to its begin, up to the first step that is no step."""
+def _nearby_path(poses: Iterable[Float64], features: FeatureParameters) -> Float64:
+    """The positions (n, 2) of poses within reach of the first along their path, up to a step that is too long."""
     near: list[Float64] = []
-    far = 0.0
-    for pose in way:
+    length = 0.0
+    for pose in poses:
         step = math.dist(pose[:2], near[-1]) if near else 0.0
-        far += step
-        if step > MAX_STEP or far > features.portal_reach:
+        length += step
+        if step > MAX_STEP or length > features.portal_reach:
             break
         near.append(pose[:2])
     return np.array(near)
@@ -109,9 +108,9 @@ def _nearby_path(way: Iterable[Float64], features: FeatureParameters) -> Float64
 def _nearest_portal(
     path: Float64, change: float, areas: tuple[int, int], arc: PoseGaussian, landmarks: Mapping[int, Sequence[Landmark]]
 ) -> list[Portal]:
-    """The portal that a path (n, 2) in the frame of the area that it leaves passes nearest to the change; none or one.
+    """The portal nearest to a change of areas on a path (n, 2) in the frame of the first area; none or one.
 
-    :param change: where the areas change, in steps from the path's begin.
+    :param change: position of the change, in steps from the path's begin.
     """
     passed: list[tuple[float, float, Portal]] = []
     for own, area in enumerate(areas):
@@ -130,9 +129,9 @@ def _portal_from_opening(
 ) -> Portal:
     """An opening of one of two areas as the portal between them.
 
-    :param forwards: whether the path goes through it in its own heading, from the first of the areas to the second.
-    :param own: which of the two areas knows it.
-    :param arc: the belief over the second area's pose in the first.
+    :param forwards: whether the path, from the first area to the second, passes it in its own heading.
+    :param own: index of the area of the opening.
+    :param arc: belief over the second area's pose in the first.
     """
     towards = forwards == (areas[0] < areas[1])
     pose = opening.pose if towards else opening.pose.compose(_HALF_TURN)

@@ -1,1 +1,1 @@
-"""Places: landmarks along hallways, their graph, and the robot's belief over where in it it is."""
+"""Places along hallways: landmarks, the graph of places, and the belief over the robot's position in it."""

@@ -1,4 +1,4 @@
-"""What the keyframes of a map's areas show, each area looked up once as long as its keyframes stay where they are."""
+"""Views of areas: landmarks and free space of their keyframes, cached as long as the keyframes do not move."""
 
 from __future__ import annotations
 
@@ -21,20 +21,19 @@ from hmt_slam_ros.landmarks.landmark_map import LandmarkMap
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
-# Of an area that differs from hypothesis to hypothesis so many are kept.
 _VERSIONS = 4
+"""Views of one area that are kept, as its keyframes differ between hypotheses."""
 
 
 class AreaView(NamedTuple):
-    """What an area's keyframes show, in its frame.
+    """Landmarks and free space that an area's keyframes show, in its frame.
 
     :ivar landmarks: of the area.
-    :ivar keyframes: shape (n,), numbers of its keyframes.
+    :ivar keyframes: shape (n,), ids of its keyframes.
     :ivar poses: shape (n, 3), their ``area_T_base``.
-    :ivar sector_distances: shape (n, 72), how far one sees around each, m, in the frame of the base.
-    :ivar hallway_lengths: shape (n,), how long the hallway is that each was taken in, m; nan in none.
-    :ivar min_hallway_lengths: shape (n,), how long a hallway as wide as there would be at least, m; nan where that is
-        not known.
+    :ivar sector_distances: shape (n, 72), free distances around each, m, in the frame of the base.
+    :ivar hallway_lengths: shape (n,), length of the hallway around each, m; nan outside hallways.
+    :ivar min_hallway_lengths: shape (n,), shortest hallway of the width there, m; nan where the width is unknown.
     """
 
     landmarks: tuple[Landmark, ...]
@@ -46,9 +45,9 @@ class AreaView(NamedTuple):
 
 
 class _AreaViewBuilder:
-    """What an area shows to which keyframes are added.
+    """View of an area to which keyframes are added.
 
-    :ivar keyframes: {keyframe: ``area_T_base`` (3,)} of those that were.
+    :ivar keyframes: {keyframe: ``area_T_base`` (3,)} of those added so far.
     """
 
     def __init__(self, mapping: LocalMapping) -> None:
@@ -57,38 +56,38 @@ class _AreaViewBuilder:
         self.keyframes: dict[int, Float64] = {}
 
     def release(self) -> None:
-        """The area does not grow any more."""
+        """Give the grid of the area back."""
         self._area.release()
 
     def is_prefix_of(self, keyframes: Mapping[int, Float64]) -> bool:
-        """Whether an area of keyframes was this one before some were added."""
+        """Whether these keyframes are the ones added so far, with more behind them."""
         first = dict(islice(keyframes.items(), len(self.keyframes)))
         return list(first) == list(self.keyframes) and has_same_poses(first, self.keyframes)
 
     def add(self, keyframes: Mapping[int, Float64], scans: Mapping[int, Scan], max_keyframes: int) -> int:
-        """Add so many at most of the keyframes that it lacks; how many these were."""
+        """Add up to ``max_keyframes`` of the missing keyframes, and return their number."""
         before = len(self.keyframes)
         for keyframe, pose in islice(keyframes.items(), before, before + max_keyframes):
-            sighting = self._area.observe_keyframe(scans[keyframe], pose)
-            sighting.update_map(self._landmark_map)
-            self._sector_distances.append(distances_around(sighting.rays))
+            observation = self._area.observe_keyframe(scans[keyframe], pose)
+            observation.update_map(self._landmark_map)
+            self._sector_distances.append(distances_around(observation.rays))
             self.keyframes[keyframe] = pose
         return len(self.keyframes) - before
 
     @property
     def view(self) -> AreaView:
-        """What the area shows."""
-        keyframes = self.keyframes
-        around, numbers = np.array(self._sector_distances), np.array(list(keyframes), dtype=np.int64)
-        lengths = np.array([_hallway_lengths(away, self._features) for away in around]).reshape(-1, 2)
-        return AreaView(tuple(self._landmark_map.landmarks), numbers, stack_poses(keyframes), around, *lengths.T)
+        """The view of the keyframes added so far."""
+        distances, keyframes = np.array(self._sector_distances), np.array(list(self.keyframes), dtype=np.int64)
+        lengths = np.array([_hallway_lengths(row, self._features) for row in distances]).reshape(-1, 2)
+        landmarks = tuple(self._landmark_map.landmarks)
+        return AreaView(landmarks, keyframes, stack_poses(self.keyframes), distances, *lengths.T)
 
 
 class AreaViewCache:
-    """Looks up what areas show, and keeps it; of the area that was looked up last also what that takes to grow.
+    """Cache of area views; the area built last can grow without a rebuild.
 
     :ivar scans: {keyframe: scan}, which may grow.
-    :ivar area_landmarks: gathers landmarks.
+    :ivar area_landmarks: extracts landmarks.
     """
 
     def __init__(self, mapping: LocalMapping, scans: Mapping[int, Scan]) -> None:
@@ -97,7 +96,7 @@ class AreaViewCache:
         self._builder = _AreaViewBuilder(mapping)
 
     def clear(self) -> None:
-        """Forget what areas show, which is looked up again where it is asked for."""
+        """Remove all views, which are then rebuilt on demand."""
         if self._views or self._builder.keyframes:
             self._views.clear()
             self._reset_builder()
@@ -107,24 +106,24 @@ class AreaViewCache:
         self._builder = _AreaViewBuilder(self._mapping)
 
     def views_of_map(self, hybrid_map: HybridMap) -> dict[int, AreaView]:
-        """{area: what it shows}, of all areas of a map."""
+        """{area: view} of all areas of a map."""
         return {area: self.area_view(area, hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()}
 
     def area_view(self, area: int, keyframes: Mapping[int, Float64]) -> AreaView:
-        """What an area shows.
+        """The view of an area.
 
         :param keyframes: {keyframe: ``area_T_base`` (3,)}.
         """
-        held = self._cached_view(area, keyframes)
-        if held is None:
+        view = self._cached_view(area, keyframes)
+        if view is None:
             self._add_keyframes(area, keyframes, len(keyframes))
-            held = self._views[area][_cache_key(keyframes)]
-        return held
+            view = self._views[area][_cache_key(keyframes)]
+        return view
 
     def prefetch(self, areas: Iterable[tuple[int, Mapping[int, Float64]]], max_keyframes: int) -> None:
-        """Look at so many keyframes at most of areas of which it is not kept what they show.
+        """Process up to ``max_keyframes`` keyframes of areas without a cached view.
 
-        :param areas: with their keyframes as in `of`, in the order in which they are looked up.
+        :param areas: with their keyframes as in `area_view`, in the order of later use.
         """
         for area, keyframes in areas:
             if max_keyframes <= 0:
@@ -133,34 +132,34 @@ class AreaViewCache:
                 max_keyframes -= self._add_keyframes(area, keyframes, max_keyframes)
 
     def _add_keyframes(self, area: int, keyframes: Mapping[int, Float64], max_keyframes: int) -> int:
-        """Look at so many keyframes at most of an area, and keep what it shows after the last; how many these were."""
+        """Process up to ``max_keyframes`` keyframes of an area, and return the number; cache the view at the end."""
         if not self._builder.is_prefix_of(keyframes):
             self._reset_builder()
         count = self._builder.add(keyframes, self.scans, max_keyframes)
         if len(self._builder.keyframes) == len(keyframes):
-            kept = self._views.setdefault(area, OrderedDict())
-            kept[_cache_key(keyframes)] = self._builder.view
-            if len(kept) > _VERSIONS:
-                kept.popitem(last=False)
+            versions = self._views.setdefault(area, OrderedDict())
+            versions[_cache_key(keyframes)] = self._builder.view
+            if len(versions) > _VERSIONS:
+                versions.popitem(last=False)
         return count
 
     def _cached_view(self, area: int, keyframes: Mapping[int, Float64]) -> AreaView | None:
-        """What an area shows, if it is kept and its keyframes are where they were."""
-        kept, key = self._views.get(area), _cache_key(keyframes)
-        if kept is None or key not in kept:
+        """The view of an area, if one of these keyframes and poses is cached."""
+        versions, key = self._views.get(area), _cache_key(keyframes)
+        if versions is None or key not in versions:
             return None
-        kept.move_to_end(key)
-        return kept[key]
+        versions.move_to_end(key)
+        return versions[key]
 
 
 def _cache_key(keyframes: Mapping[int, Float64]) -> bytes:
-    """What differs where other keyframes are in an area, or elsewhere in it."""
+    """The ids and poses of an area's keyframes as bytes."""
     return np.array(list(keyframes), dtype=np.int64).tobytes() + stack_poses(keyframes).tobytes()
 
 
-def _hallway_lengths(away: Float64, features: FeatureParameters) -> tuple[float, float]:
-    """The length of the hallway in which one sees so far around, nan in none, and the least of one as wide, m."""
-    space = space_from_distances(away)
+def _hallway_lengths(distances: Float64, features: FeatureParameters) -> tuple[float, float]:
+    """Length of the hallway with these free distances, nan for none, and of the shortest of its width, m."""
+    space = space_from_distances(distances)
     if space is None:
         return math.nan, math.nan
     shortest = min_hallway_length(space.width, features)

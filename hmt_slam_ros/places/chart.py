@@ -1,13 +1,12 @@
-"""The chart of an HMT map: crossings of hallways and doors, the ways between them, and the landmarks beside these.
+"""The chart of an HMT map: doors and crossings along hallways, the edges between them, and the landmarks on these.
 
-Tomatis, Nourbakhsh and Siegwart (2003), section 2.1, Fig. 2. A node is where one or more openings lead off a hallway
-that the robot drove along: the place before them in the hallway's middle. Openings of nearly the same place are of one
-node. So a door is one node that several areas know; so are two openings opposite each other, and the mouth of a
-hallway with what it leads to on both sides. A node with an opening to another hallway is a crossing, others are doors.
-The end of a hallway is a node, too, where the robot has to turn; it is none of the paper's states.
+Tomatis, Nourbakhsh and Siegwart (2003), section 2.1, Fig. 2. A node is the point in the middle of a driven hallway
+before one or more openings. Openings of nearly the same point belong to one node: those of one door in several areas,
+and those opposite each other. A node with an opening to another hallway is a crossing, others are doors. The end of a
+hallway, where the robot has to turn, is a node that the paper does not have.
 
-An edge is a stretch of hallway between two nodes all of which was driven along and that nothing closed since; the
-landmarks on it are those of the hallway's walls. Places are compared only within what is around one area, see floor.py.
+An edge is a segment of hallway between two nodes that was driven along completely and is still free. Its landmarks are
+those of the hallway's walls. Positions are compared only within the neighborhood of one area, see floor.py.
 """
 
 from __future__ import annotations
@@ -30,6 +29,7 @@ from hmt_slam_ros.places.floor import (
     DIRECTIONS,
     AlignedNeighborhood,
     SideOpening,
+    ahead_and_beside,
     aligned_neighborhoods,
     find_side_openings,
 )
@@ -44,33 +44,47 @@ from hmt_slam_ros.places.wall_landmarks import (
 )
 
 DOOR, CROSSING, END = range(3)
-"""What a node is."""
+"""Kinds of nodes."""
 
 NODE_KIND_NAMES = ("door", "crossing", "end")
-"""Their names."""
+"""Names of the kinds."""
 
 END_NODE_TO_WALL = 1.0
-"""So far before the wall at the end of a hallway, m, is the node there, where a robot turns."""
+"""Distance from the node at the end of a hallway to the wall there, m."""
 
-# Places nearer to each other than this, m, are one node.
-_SAME = 0.6
-# A hallway was driven along without a gap longer than this, m, within so much of its middle, m; its end is so far
-# behind the last keyframe, and the next node beyond what was driven along, m, at most.
-_GAP, _MIDDLE, _END, _MAX_UNDRIVEN_DISTANCE = 3.0, 0.9, 4.0, 1.0
-# An end that is nearer than this to the last node, m, is none of its own.
-_APART = 1.5
-# Deviation of a node's place in its area, m, and of the direction of a hallway, rad.
-_PLACED, _STRAIGHT = 0.02, 0.01
+_SAME_NODE_DISTANCE = 0.6
+"""Openings whose junction points are nearer than this, m, belong to one node."""
+
+_MAX_GAP = 3.0
+"""Longest gap between keyframes along a hallway that counts as driven, m."""
+
+_MAX_LATERAL_OFFSET = 0.9
+"""Largest distance of keyframes and nodes of a hallway from its middle, m."""
+
+_MAX_DISTANCE_TO_END = 4.0
+"""Largest distance from the last keyframe to the wall at the end of a hallway, m."""
+
+_MAX_UNDRIVEN_DISTANCE = 1.0
+"""Largest distance from the last keyframe to the next node, m."""
+
+_MIN_EDGE_TO_END = 1.5
+"""The end of a hallway nearer than this to its last node, m, is no node."""
+
+_NODE_DEVIATION = 0.02
+"""Deviation of a node's position in its area, m."""
+
+_HALLWAY_DIRECTION_DEVIATION = 0.01
+"""Deviation of the direction of a hallway, rad."""
 
 
 class ChartNode(NamedTuple):
-    """A node.
+    """A node of the chart.
 
     :ivar area: in whose frame it is known.
     :ivar pose: shape (3,), ``area_T_node``, in the hallway's middle, with the heading north, m and rad.
     :ivar kind: one of the constants above.
-    :ivar existence: probability that it is there.
-    :ivar openings: that lead off there, the best known of every direction.
+    :ivar existence: probability that it exists.
+    :ivar openings: the best known of every direction.
     """
 
     area: int
@@ -85,8 +99,8 @@ class Chart:
     """The places of an HMT map.
 
     :ivar nodes: crossings, doors, and ends of hallways.
-    :ivar graph_nodes: the same as nodes of the graph of places.
-    :ivar edges: of that graph, in both directions.
+    :ivar graph_nodes: the same as nodes of the place graph.
+    :ivar edges: of the place graph, in both directions.
     """
 
     nodes: tuple[ChartNode, ...]
@@ -94,16 +108,16 @@ class Chart:
     edges: tuple[Edge, ...]
 
     def name(self, node: int) -> str:
-        """Such as "door 3"; the numbers are those of the nodes, of whatever kind."""
+        """Name of a node by kind and number, such as "door 3"."""
         return f"{NODE_KIND_NAMES[self.nodes[node].kind]} {node}"
 
     def graph(self, places: PlaceParameters) -> PlaceGraph:
-        """The graph of places."""
+        """The place graph."""
         return build_place_graph(self.graph_nodes, self.edges, places)
 
 
 class _NodeDraft(NamedTuple):
-    """A node, (2,), in the frame of its area's floor, with the landmarks (area, number) that it is made of."""
+    """A node at a position (2,) in its area's neighborhood, with the landmarks (area, number) of its openings."""
 
     area: int
     position: Float64
@@ -114,13 +128,14 @@ class _NodeDraft(NamedTuple):
 
     @property
     def directions(self) -> frozenset[int]:
-        """In which a hallway may lead on."""
-        found = {turned % QUARTERS for one in self.openings for turned in (one.direction + 1, one.direction + 3)}
-        return frozenset(found | {one.direction for one in self.openings if one.leads_to_hallway})
+        """Directions in which a hallway may go on: square to openings, and through those to a hallway."""
+        ahead = {opening.direction for opening in self.openings if opening.leads_to_hallway}
+        square = {(opening.direction + turn) % QUARTERS for opening in self.openings for turn in (1, 3)}
+        return frozenset(square | ahead)
 
 
 class _ChartEdge(NamedTuple):
-    """From one node to the next: mean and variance of the distance."""
+    """An edge from one node to the next: mean and variance of its length, m and m^2."""
 
     start: int
     direction: int
@@ -130,97 +145,99 @@ class _ChartEdge(NamedTuple):
 
     @property
     def reverse(self) -> _ChartEdge:
-        """The same way in the other direction."""
+        """The same edge in the other direction."""
         return self._replace(start=self.end, direction=opposite_direction(self.direction), end=self.start)
 
 
 def build_chart(hybrid_map: HybridMap, views: Mapping[int, AreaView], features: FeatureParameters) -> Chart:
     """The chart of a map.
 
-    :param views: {area: what it shows}, of all areas.
+    :param views: {area: view} of all areas.
     """
     return _ChartBuilder(aligned_neighborhoods(hybrid_map, views), views, features).build()
 
 
 class _ChartBuilder:
-    """Makes a chart of floors."""
+    """Builds a chart from the neighborhoods of areas."""
 
     def __init__(
-        self, own: Mapping[int, AlignedNeighborhood], views: Mapping[int, AreaView], features: FeatureParameters
+        self,
+        neighborhoods: Mapping[int, AlignedNeighborhood],
+        views: Mapping[int, AreaView],
+        features: FeatureParameters,
     ) -> None:
-        self._neighborhoods, self._views, self._features = own, views, features
+        self._neighborhoods, self._views, self._features = neighborhoods, views, features
         self._landmark_cache: dict[int, KnownLandmarks] = {}
         self._drafts = [_node_draft(group, self._junction_points(group)) for group in self._groups()]
 
     def build(self) -> Chart:
-        ways = self._find_edges()
-        members = frozenset(member for place in self._drafts for member in place.members)
-        left = {(way.start, way.direction) for way in ways} | {
-            (way.end, opposite_direction(way.direction)) for way in ways
-        }
-        edges = [self._edge(way, members) for way in ways]
-        seen = tuple(self._node(k, left, members) for k in range(len(self._drafts)))
-        nodes = tuple(self._chart_node(place) for place in self._drafts)
-        return Chart(nodes, seen, tuple(each for edge in edges for each in (edge, edge.reverse)))
+        """The chart."""
+        chart_edges = self._find_edges()
+        members = frozenset(member for draft in self._drafts for member in draft.members)
+        ports = {port for edge in chart_edges for port in _ports(edge)}
+        edges = [self._edge(edge, members) for edge in chart_edges]
+        graph_nodes = tuple(self._node(k, ports, members) for k in range(len(self._drafts)))
+        nodes = tuple(self._chart_node(draft) for draft in self._drafts)
+        return Chart(nodes, graph_nodes, tuple(each for edge in edges for each in (edge, edge.reverse)))
 
-    def _chart_node(self, place: _NodeDraft) -> ChartNode:
-        pose = se2.compose(self._neighborhoods[place.area].origin, np.array((*place.position, 0.5 * np.pi)))
-        return ChartNode(place.area, pose, place.kind, place.existence, place.openings)
+    def _chart_node(self, draft: _NodeDraft) -> ChartNode:
+        pose = se2.compose(self._neighborhoods[draft.area].origin, np.array((*draft.position, 0.5 * np.pi)))
+        return ChartNode(draft.area, pose, draft.kind, draft.existence, draft.openings)
 
     def _groups(self) -> list[list[SideOpening]]:
         """The openings of each node."""
-        every = [
-            one
-            for area, floor in self._neighborhoods.items()
-            for one in find_side_openings(floor, self._views[area].landmarks)
+        openings = [
+            opening
+            for area, neighborhood in self._neighborhoods.items()
+            for opening in find_side_openings(neighborhood, self._views[area].landmarks)
         ]
         import networkx  # noqa: PLC0415  mapping does without it, and it takes a fifth of a second
 
         same = networkx.Graph()
-        same.add_nodes_from(range(len(every)))
-        for i, one in enumerate(every):
-            for k, other in enumerate(every[:i]):
-                there = self._transform_point(other.area, other.junction_point, one.area)
-                if there is not None and np.hypot(*(there - one.junction_point)) < _SAME:
+        same.add_nodes_from(range(len(openings)))
+        for i, opening in enumerate(openings):
+            for k, other in enumerate(openings[:i]):
+                point = self._transform_point(other.area, other.junction_point, opening.area)
+                if point is not None and np.hypot(*(point - opening.junction_point)) < _SAME_NODE_DISTANCE:
                     same.add_edge(i, k)
-        return [[every[k] for k in sorted(group)] for group in networkx.connected_components(same)]
+        return [[openings[k] for k in sorted(group)] for group in networkx.connected_components(same)]
 
     def _junction_points(self, group: Sequence[SideOpening]) -> Float64:
-        """Where the openings of a node lead off, of all that are known in the frame of their home, shape (n, 2)."""
-        feet = (self._transform_point(one.area, one.junction_point, _home_area(group)) for one in group)
-        return np.array([foot for foot in feet if foot is not None])
+        """Junction points of a node's openings in the neighborhood of its home area, as far as known, shape (n, 2)."""
+        points = (self._transform_point(each.area, each.junction_point, _home_area(group)) for each in group)
+        return np.array([point for point in points if point is not None])
 
-    def _transform_point(self, area: int, place: Float64, into: int) -> Float64 | None:
-        """A place (2,) of one floor in another one; None where it is not known how it lies there."""
-        pose = self._neighborhoods[into].areas.get(area)
+    def _transform_point(self, area: int, point: Float64, target: int) -> Float64 | None:
+        """A point (2,) of the neighborhood of one area in that of another; None if its pose is unknown."""
+        pose = self._neighborhoods[target].areas.get(area)
         if pose is None:
             return None
-        there = se2.compose(pose.mean, self._neighborhoods[area].origin)
-        return np.asarray(se2.transform(there, place[None])[0])
+        target_T_area = se2.compose(pose.mean, self._neighborhoods[area].origin)
+        return np.asarray(se2.transform(target_T_area, point[None])[0])
 
     def _find_edges(self) -> list[_ChartEdge]:
-        """To the north and the east, the shortest first where several claim the same; ends of hallways are added."""
-        ports = [(k, direction) for k, place in enumerate(self._drafts) for direction in sorted(place.directions)]
-        found = [way for port in ports for way in self._edge_to_next_node(*port)]
+        """Edges to the north and the east, of conflicting ones the shortest; nodes are added at ends of hallways."""
+        ports = [(k, direction) for k, draft in enumerate(self._drafts) for direction in sorted(draft.directions)]
+        candidates = [edge for port in ports for edge in self._edge_to_next_node(*port)]
         taken: set[tuple[int, int]] = set()
-        ways = []
-        for way in sorted(found, key=lambda way: (way.distance, way.start, way.direction)):
-            both = {(way.start, way.direction), (way.end, opposite_direction(way.direction))}
-            if not both & taken:
-                taken |= both
-                ways.append(way)
-        ways += [way for port in ports if port not in taken for way in self._edge_to_hallway_end(*port)]
-        return [way if way.direction in {NORTH, EAST} else way.reverse for way in ways if self._is_still_there(way)]
+        edges = []
+        for edge in sorted(candidates, key=lambda edge: (edge.distance, edge.start, edge.direction)):
+            if taken.isdisjoint(_ports(edge)):
+                taken.update(_ports(edge))
+                edges.append(edge)
+        edges += [edge for port in ports if port not in taken for edge in self._edge_to_hallway_end(*port)]
+        return [edge if edge.direction in {NORTH, EAST} else edge.reverse for edge in edges if self._exists(edge)]
 
-    def _is_still_there(self, way: _ChartEdge) -> bool:
-        place = self._drafts[way.start]
+    def _exists(self, edge: _ChartEdge) -> bool:
+        """Whether the hallway of an edge is still free."""
+        draft = self._drafts[edge.start]
         existence = edge_existence_probability(
-            self._neighborhoods[place.area], _hallway_segment(place, way), self._features
+            self._neighborhoods[draft.area], _hallway_segment(draft, edge), self._features
         )
         return existence >= self._features.landmark_least
 
     def _edge_to_next_node(self, k: int, direction: int) -> Iterator[_ChartEdge]:
-        """The way from a node in a direction to the next node; none or one."""
+        """The edge from a node in a direction to the next node; none or one."""
         far, _ = self._driven_extent(k, direction)
         found = min(self._nodes_ahead(k, direction, far + _MAX_UNDRIVEN_DISTANCE), default=None)
         if found is not None:
@@ -228,48 +245,49 @@ class _ChartBuilder:
             yield _ChartEdge(k, direction, other, distance, self._variance(k, other, direction))
 
     def _edge_to_hallway_end(self, k: int, direction: int) -> Iterator[_ChartEdge]:
-        """The way from a node in a direction to the end of the hallway, which becomes a node; none or one."""
-        place = self._drafts[k]
+        """The edge from a node in a direction to the end of the hallway, which becomes a node; none or one."""
+        draft = self._drafts[k]
         far, last = self._driven_extent(k, direction)
-        wall = math.nan if last is None else float(self._neighborhoods[place.area].free_distances[last, direction])
+        wall = math.nan if last is None else float(self._neighborhoods[draft.area].free_distances[last, direction])
         distance = far + wall - END_NODE_TO_WALL
-        if wall <= _END and distance > _APART:
-            at = place.position + distance * DIRECTIONS[direction]
-            self._drafts.append(_NodeDraft(place.area, at, END, 1.0, (), frozenset()))
-            yield _ChartEdge(k, direction, len(self._drafts) - 1, distance, 2.0 * _PLACED**2)
+        if wall <= _MAX_DISTANCE_TO_END and distance > _MIN_EDGE_TO_END:
+            end = draft.position + distance * DIRECTIONS[direction]
+            self._drafts.append(_NodeDraft(draft.area, end, END, 1.0, (), frozenset()))
+            yield _ChartEdge(k, direction, len(self._drafts) - 1, distance, 2.0 * _NODE_DEVIATION**2)
 
     def _driven_extent(self, k: int, direction: int) -> tuple[float, int | None]:
-        """How far the robot drove along a hallway ahead of a node, m, and the keyframe that is the farthest there."""
-        place = self._drafts[k]
-        floor = self._neighborhoods[place.area]
-        ahead, beside = _ahead_and_beside(floor.positions, place.position, direction)
-        own = np.flatnonzero(floor.in_hallway[:, direction % 2] & (np.abs(beside) <= _MIDDLE) & (ahead > 0.0))
+        """Length of the driven hallway ahead of a node, m, and the row of its last keyframe."""
+        draft = self._drafts[k]
+        neighborhood = self._neighborhoods[draft.area]
+        ahead, beside = ahead_and_beside(neighborhood.positions - draft.position, direction)
+        within = neighborhood.in_hallway[:, direction % 2] & (np.abs(beside) <= _MAX_LATERAL_OFFSET) & (ahead > 0.0)
+        rows = np.flatnonzero(within)
         far, last = 0.0, None
-        for keyframe in own[np.argsort(ahead[own], kind="stable")].tolist():
-            if ahead[keyframe] - far > _GAP:
+        for row in rows[np.argsort(ahead[rows], kind="stable")].tolist():
+            if ahead[row] - far > _MAX_GAP:
                 break
-            far, last = float(ahead[keyframe]), keyframe
+            far, last = float(ahead[row]), row
         return far, last
 
     def _nodes_ahead(self, k: int, direction: int, far: float) -> Iterator[tuple[float, int]]:
-        """Distances and numbers of the nodes along a hallway, up to so far."""
-        place = self._drafts[k]
-        for other, there in enumerate(self._drafts):
-            at = self._transform_point(there.area, there.position, place.area)
-            if other == k or at is None or direction not in there.directions:
+        """Distances and numbers of the nodes along a hallway, up to a distance, m."""
+        draft = self._drafts[k]
+        for number, other in enumerate(self._drafts):
+            point = self._transform_point(other.area, other.position, draft.area)
+            if number == k or point is None or direction not in other.directions:
                 continue
-            ahead, beside = _ahead_and_beside(at[None], place.position, direction)
-            if _SAME < ahead[0] <= far and abs(beside[0]) <= _MIDDLE:
-                yield float(ahead[0]), other
+            ahead, beside = ahead_and_beside(point - draft.position, direction)
+            if _SAME_NODE_DISTANCE < ahead <= far and abs(beside) <= _MAX_LATERAL_OFFSET:
+                yield float(ahead), number
 
-    def _variance(self, k: int, other: int, direction: int) -> float:
-        """Of the distance between two nodes."""
-        place, there = self._drafts[k], self._drafts[other]
-        pose = self._neighborhoods[place.area].areas[there.area]
-        at = se2.compose(self._neighborhoods[there.area].origin, np.array((*there.position, 0.0)))
-        belief = pose.compose(PoseGaussian.from_pose(at))
+    def _variance(self, k: int, number: int, direction: int) -> float:
+        """Variance of the distance between two nodes, m^2."""
+        draft, other = self._drafts[k], self._drafts[number]
+        pose = self._neighborhoods[draft.area].areas[other.area]
+        point = se2.compose(self._neighborhoods[other.area].origin, np.array((*other.position, 0.0)))
+        belief = pose.compose(PoseGaussian.from_pose(point))
         along = se2.transform(np.array((0.0, 0.0, -belief.mean[2])), DIRECTIONS[direction][None])[0]
-        return float(along @ belief.covariance[:2, :2] @ along) + 2.0 * _PLACED**2
+        return float(along @ belief.covariance[:2, :2] @ along) + 2.0 * _NODE_DEVIATION**2
 
     def _landmarks_around(self, area: int) -> KnownLandmarks:
         if area not in self._landmark_cache:
@@ -277,60 +295,63 @@ class _ChartBuilder:
             self._landmark_cache[area] = known_landmarks_around(self._neighborhoods[area].areas, landmarks)
         return self._landmark_cache[area]
 
-    def _edge(self, way: _ChartEdge, members: frozenset[tuple[int, int]]) -> Edge:
-        place = self._drafts[way.start]
+    def _edge(self, edge: _ChartEdge, members: frozenset[tuple[int, int]]) -> Edge:
+        """An edge of the place graph."""
+        draft = self._drafts[edge.start]
         landmarks = segment_landmarks(
-            self._landmarks_around(place.area), self._neighborhoods[place.area], _hallway_segment(place, way), members
+            self._landmarks_around(draft.area), self._neighborhoods[draft.area], _hallway_segment(draft, edge), members
         )
-        distance = (way.distance, way.variance)
-        return Edge(way.start, way.direction, way.end, way.direction, distance, (0.0, _STRAIGHT**2), landmarks)
+        distance, turn = (edge.distance, edge.variance), (0.0, _HALLWAY_DIRECTION_DEVIATION**2)
+        return Edge(edge.start, edge.direction, edge.end, edge.direction, distance, turn, landmarks)
 
-    def _node(self, k: int, left: set[tuple[int, int]], members: frozenset[tuple[int, int]]) -> Node:
-        """The landmarks of a node: its openings, and what is ahead and back where no edge holds it."""
-        place = self._drafts[k]
-        lists = []
+    def _node(self, k: int, ports: set[tuple[int, int]], members: frozenset[tuple[int, int]]) -> Node:
+        """A node of the place graph: its openings, and the landmarks ahead and back where it has no edge.
+
+        :param ports: (node, direction) of both ends of all edges.
+        """
+        draft = self._drafts[k]
+        sequences = []
         for direction in (NORTH, EAST):
-            begin = 0.0 if (k, opposite_direction(direction)) in left else -np.inf
-            end = 0.0 if (k, direction) in left else np.inf
-            stretch = HallwaySegment(place.position, direction, begin, end)
-            around, floor = self._landmarks_around(place.area), self._neighborhoods[place.area]
-            found = segment_landmarks(around, floor, stretch, members, place.members)
-            led = not math.isinf(begin) or not math.isinf(end)
-            sides = [d for d in (direction - 1, direction + 1) if led and (k, d % QUARTERS) in left]
-            lists.append(add_hallway_openings(found, floor, place.position, direction, sides))
-        return Node(place.existence, *lists)
+            begin = 0.0 if (k, opposite_direction(direction)) in ports else -np.inf
+            end = 0.0 if (k, direction) in ports else np.inf
+            segment = HallwaySegment(draft.position, direction, begin, end)
+            around, neighborhood = self._landmarks_around(draft.area), self._neighborhoods[draft.area]
+            landmarks = segment_landmarks(around, neighborhood, segment, members, draft.members)
+            has_edge = not math.isinf(begin) or not math.isinf(end)
+            sides = [d for d in (direction - 1, direction + 1) if has_edge and (k, d % QUARTERS) in ports]
+            sequences.append(add_hallway_openings(landmarks, neighborhood, draft.position, direction, sides))
+        return Node(draft.existence, *sequences)
 
 
-def _node_draft(group: Sequence[SideOpening], feet: Float64) -> _NodeDraft:
-    """The node of some openings, in the frame of the area in which one of them was seen most often.
+def _ports(edge: _ChartEdge) -> tuple[tuple[int, int], tuple[int, int]]:
+    """(node, direction) in which an edge is entered at either end."""
+    return (edge.start, edge.direction), (edge.end, opposite_direction(edge.direction))
 
-    :param feet: shape (n, 2), their places in the hallway's middle, in that frame.
+
+def _node_draft(group: Sequence[SideOpening], points: Float64) -> _NodeDraft:
+    """The node of a group of openings, in the neighborhood of its home area.
+
+    :param points: shape (n, 2), junction points in that neighborhood, m.
     """
     best: dict[int, SideOpening] = {}
-    for one in sorted(group, key=_sighting_rank, reverse=True):
-        best.setdefault(one.direction, one)
+    for opening in sorted(group, key=_detection_rank, reverse=True):
+        best.setdefault(opening.direction, opening)
     openings = tuple(best[direction] for direction in sorted(best))
-    hallway = any(one.leads_to_hallway for one in openings)
-    existence = max(one.landmark.existence.probability for one in openings)
-    members = frozenset((one.area, one.number) for one in group)
-    return _NodeDraft(_home_area(group), feet.mean(axis=0), CROSSING if hallway else DOOR, existence, openings, members)
+    kind = CROSSING if any(opening.leads_to_hallway for opening in openings) else DOOR
+    existence = max(opening.landmark.existence.probability for opening in openings)
+    members = frozenset((opening.area, opening.number) for opening in group)
+    return _NodeDraft(_home_area(group), points.mean(axis=0), kind, existence, openings, members)
 
 
 def _home_area(group: Sequence[SideOpening]) -> int:
-    """The area in which one of some openings was seen most often."""
-    return max(group, key=_sighting_rank).area
+    """The area of the opening that was detected most often."""
+    return max(group, key=_detection_rank).area
 
 
-def _sighting_rank(opening: SideOpening) -> tuple[int, float]:
-    """What openings are ranked by: one that was seen once, from afar, is believed in, but its place is not known."""
+def _detection_rank(opening: SideOpening) -> tuple[int, float]:
+    """Detections first: an opening that was detected once, from afar, may exist for certain and yet be misplaced."""
     return opening.landmark.existence.detections, opening.landmark.existence.probability
 
 
-def _hallway_segment(place: _NodeDraft, way: _ChartEdge) -> HallwaySegment:
-    return HallwaySegment(place.position, way.direction, 0.0, way.distance)
-
-
-def _ahead_and_beside(places: Float64, at: Float64, direction: int) -> tuple[Float64, Float64]:
-    """How far places (n, 2) are ahead of and beside another one for a robot that looks in a direction, m."""
-    away = places - at
-    return away @ DIRECTIONS[direction], away @ DIRECTIONS[(direction + 1) % QUARTERS]
+def _hallway_segment(draft: _NodeDraft, edge: _ChartEdge) -> HallwaySegment:
+    return HallwaySegment(draft.position, edge.direction, 0.0, edge.distance)

@@ -1,8 +1,9 @@
-"""Where a robot is between the walls: in a frame along these, with its last node and the middle of its hallway.
+"""The robot between the walls: its heading, its hallway's middle and its last node, in a frame along the walls.
 
-Tomatis, Nourbakhsh and Siegwart (2003), section 3.3: its heading between the walls is estimated apart from its place,
-Eq. (2). Odometry is its place for the few metres that count, which are those since its last node. What a driver goes by
-is told in the frame of the base.
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.3, Eq. (2). Walls are parallel or square to each other, so each line
+tells the heading up to quarters of a turn. An extended Kalman filter over the heading alone needs no map and does not
+drift. The noise of lines averages out; the deviation of walls from square does not, and is kept apart. The position is
+that of odometry, which is accurate enough since the last node.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.landmarks.area_classes import (
     UNKNOWN_DISTANCES,
     distances_around,
@@ -23,68 +24,145 @@ from hmt_slam_ros.landmarks.area_classes import (
     sector_indices,
     space_from_distances,
 )
-from hmt_slam_ros.landmarks.beam_labels import Rays
-from hmt_slam_ros.landmarks.heading import QUARTER_TURN, BuildingHeading
 from hmt_slam_ros.landmarks.line_extraction import Lines
+from hmt_slam_ros.landmarks.rays import Rays
+from hmt_slam_ros.places.observation_graph import QUARTER_TURN
 from hmt_slam_ros.sensors.motion_model import RelativeMotion
 
-# Walls are within this angle of the hallway's axis, or of square to it, rad.
 _WALL_ANGLE_TOLERANCE = math.radians(20.0)
-# So much of a wall is seen, m, up to so far to both sides of the robot: of a wall across, and of one beside it, m; that
-# is so near, m.
-_MIN_VISIBLE_LENGTH, _ACROSS, _BESIDE, _NEAR = 0.8, 0.8, 4.0, 2.5
+"""Largest angle of a wall to the hallway's axis, or to the square of it, rad."""
+
+_MIN_VISIBLE_LENGTH = 0.8
+"""Visible length of a wall, at least, m."""
+
+_VISIBLE_RANGE_ACROSS = 0.8
+"""The visible length of a wall across the hallway counts up to this distance to both sides of the robot, m."""
+
+_VISIBLE_RANGE_BESIDE = 4.0
+"""The same for a wall beside the hallway, m."""
+
+_MAX_WALL_DISTANCE = 2.5
+"""Largest distance of a wall beside the hallway, m."""
+
+ALIGNMENT_TOLERANCE = math.radians(25.0)
+"""Largest angle between a robot and the axis or opening that it faces, rad."""
+
+_MIN_CHORD_SHARE = 0.5
+"""Smallest share of the hallway's length that a chord along its axis has."""
+
+_POSITION_DEVIATION = 0.02
+"""Deviation of the position at which landmarks are observed, m."""
+
+
+class BuildingHeading:
+    """The heading in a frame along the walls; unknown before the first lines. Its x is the axis nearest to these.
+
+    :ivar angle: rad, without wrapping; nan while unknown.
+    """
+
+    def __init__(self, features: FeatureParameters) -> None:
+        self._gate = chi_square_gate(features.pair_probability, 1)
+        self._wall_variance = math.radians(features.square_deviation) ** 2
+        self.angle = math.nan
+        self._line_variance, self._squareness_variance = 0.0, 0.0
+
+    @property
+    def is_known(self) -> bool:
+        """Whether lines were seen."""
+        return not math.isnan(self.angle)
+
+    @property
+    def variance(self) -> float:
+        """Variance of the angle, rad^2."""
+        return self._line_variance + self._squareness_variance
+
+    def predict(self, step: RelativeMotion) -> None:
+        """Add the rotation of a motion."""
+        self.angle += float(step.increment[2])
+        self._line_variance += float(step.covariance[2, 2])
+
+    def observe(self, lines: Lines) -> int:
+        """Correct the heading by the lines that are parallel or square to the walls, and return their number."""
+        alphas, noise = lines.parameters[:, 0], lines.covariances[:, 0, 0]
+        before = self.variance
+        if not self.is_known:
+            if not len(lines):
+                return 0
+            k = _consensus_line(alphas, noise + self._wall_variance)
+            self.angle, before = float(_wrap_to_quarter(-alphas[k])), float(noise[k])
+            self._line_variance = QUARTER_TURN**2
+        differences = _wrap_to_quarter(-alphas - self.angle)
+        # Eq. (2), n = 1.
+        used = differences**2 <= self._gate * (noise + self._wall_variance + before)
+        if used.any():
+            self._correct(differences[used], noise[used])
+        return int(used.sum())
+
+    def _correct(self, differences: Float64, noise: Float64) -> None:
+        """Correct the heading by the weighted mean of differences, rad, with their noise, rad^2."""
+        weights = 1.0 / (noise + self._wall_variance)
+        weights /= weights.sum()
+        together = float(weights**2 @ noise)
+        gain = self._line_variance / (self._line_variance + together)
+        self.angle += gain * float(weights @ differences)
+        self._line_variance *= 1.0 - gain
+        self._squareness_variance = self._wall_variance * float(weights @ weights)
+
+
+def _consensus_line(alphas: Float64, variances: Float64) -> int:
+    """Number of the line that agrees best with the others, weighted by their accuracy."""
+    apart = _wrap_to_quarter(alphas[:, None] - alphas[None, :])
+    agreeing = np.exp(-0.5 * apart**2 / (variances[:, None] + variances[None, :])) / np.sqrt(variances)
+    return int(agreeing.sum(axis=1).argmax())
+
+
+def _wrap_to_quarter(angles: Float64) -> Float64:
+    """Angles up to quarters of a turn, in [-pi/4, pi/4)."""
+    return (angles + 0.5 * QUARTER_TURN) % QUARTER_TURN - 0.5 * QUARTER_TURN
 
 
 def distance_to_wall_ahead(lines: Lines, bearing: float) -> float | None:
-    """How far the nearest wall across a hallway is, m; None where there is none.
+    """Distance to the nearest wall across a hallway, m; None for none.
 
     :param bearing: of the hallway, rad, the robot's frame.
     """
-    walls = lines.parameters[_is_across(lines, bearing) & (_visible_lengths(lines, _ACROSS) >= _MIN_VISIBLE_LENGTH), 1]
+    visible = _visible_lengths(lines, _VISIBLE_RANGE_ACROSS) >= _MIN_VISIBLE_LENGTH
+    walls = lines.parameters[_is_across(lines, bearing) & visible, 1]
     return float(walls.min()) if walls.size else None
 
 
 def distance_to_wall_beside(lines: Lines, bearing: float) -> float | None:
-    """How far the wall on a side of a hallway is, m; None where none is seen.
+    """Distance to the wall on a side of a hallway, m; None for none.
 
-    It is the line of which most is seen: people, and the leaves of closed doors, are shorter.
+    It is the line with the longest visible part: people and closed doors are shorter.
 
     :param bearing: of the side, rad, the robot's frame.
     """
-    beside = _is_across(lines, bearing) & (lines.parameters[:, 1] <= _NEAR)
-    seen = np.where(beside, _visible_lengths(lines, _BESIDE), 0.0)
-    if not seen.size or seen.max() < _MIN_VISIBLE_LENGTH:
+    beside = _is_across(lines, bearing) & (lines.parameters[:, 1] <= _MAX_WALL_DISTANCE)
+    visible = np.where(beside, _visible_lengths(lines, _VISIBLE_RANGE_BESIDE), 0.0)
+    if not visible.size or visible.max() < _MIN_VISIBLE_LENGTH:
         return None
-    return float(lines.parameters[int(np.argmax(seen)), 1])
+    return float(lines.parameters[int(np.argmax(visible)), 1])
 
 
 def _is_across(lines: Lines, bearing: float) -> Bool:
-    """Which lines are square to a bearing, shape (n,)."""
+    """Whether lines are square to a bearing, shape (n,)."""
     return np.asarray(np.abs(se2.wrap(lines.parameters[:, 0] - bearing)) <= _WALL_ANGLE_TOLERANCE)
 
 
-def _visible_lengths(lines: Lines, around: float) -> Float64:
-    """How much is seen of lines up to so far to both sides of the robot, m, shape (n,)."""
-    seen = np.zeros(len(lines))
-    near = np.clip(lines.segments, -around, around)
-    np.add.at(seen, lines.owners, near[:, 1] - near[:, 0])
-    return seen
-
-
-ALIGNMENT_TOLERANCE = math.radians(25.0)
-"""A robot is along an axis, and looks through an opening, within this angle of it, rad."""
-
-# A chord along a hallway is this share of the longest one.
-_LONG = 0.5
-# Deviation of what is seen of the robot's place, m.
-_POSITION_DEVIATION = 0.02
+def _visible_lengths(lines: Lines, reach: float) -> Float64:
+    """Visible lengths of lines up to a distance to both sides of the robot, m, shape (n,)."""
+    lengths = np.zeros(len(lines))
+    within = np.clip(lines.segments, -reach, reach)
+    np.add.at(lengths, lines.owners, within[:, 1] - within[:, 0])
+    return lengths
 
 
 class DetectedNode(NamedTuple):
-    """A node that the robot is at, or that it passed.
+    """A node at or behind the robot.
 
     :ivar position: shape (2,), in the frame along the walls, m.
-    :ivar variance: of its place along the hallway as seen from the robot now, m^2.
+    :ivar variance: of its position along the hallway relative to the robot, m^2.
     """
 
     position: Float64
@@ -94,12 +172,12 @@ class DetectedNode(NamedTuple):
 class CorridorFrame:
     """A robot, its hallway and its last node, in the frame along the walls.
 
-    An axis is so many quarters of a turn to the left from x, without wrapping.
+    An axis is a number of quarters of a turn to the left of x, without wrapping.
 
     :ivar pose: shape (3,), ``walls_T_base``, m and rad.
-    :ivar travel_axis: along which the robot travels.
-    :ivar hallway_center: shape (2,), a place in the middle of the hallway, m.
-    :ivar last_node: the last one; None before the first one.
+    :ivar travel_axis: the axis of travel.
+    :ivar hallway_center: shape (2,), a point in the middle of the hallway, m.
+    :ivar last_node: None before the first one.
     """
 
     def __init__(self, features: FeatureParameters) -> None:
@@ -109,7 +187,7 @@ class CorridorFrame:
         self.last_node: DetectedNode | None = None
 
     def predict(self, step: RelativeMotion) -> None:
-        """The robot moved."""
+        """Move the robot."""
         self._heading.predict(step)
         if not self.is_initialized:
             return
@@ -121,7 +199,7 @@ class CorridorFrame:
             )
 
     def observe(self, lines: Lines, rays: Rays) -> None:
-        """Correct the heading by the lines of a scan, and keep how far its beams see."""
+        """Correct the heading by the lines of a scan, and update the free distances by its beams."""
         self._heading.observe(lines)
         if self.is_initialized:
             self.pose = np.array((*self.position, self._heading.angle))
@@ -129,12 +207,12 @@ class CorridorFrame:
 
     @property
     def is_initialized(self) -> bool:
-        """Whether walls were seen."""
+        """Whether walls were observed."""
         return self._heading.is_known
 
     @property
     def position(self) -> Float64:
-        """Where the robot is, m, shape (2,)."""
+        """Position of the robot, m, shape (2,)."""
         return self.pose[:2]
 
     @property
@@ -146,95 +224,93 @@ class CorridorFrame:
 
     @property
     def facing_axis(self) -> int:
-        """The axis along which the robot looks most nearly."""
+        """The axis nearest to the robot's heading."""
         return round(self.pose[2] / QUARTER_TURN)
 
     @property
     def heading_error(self) -> float:
-        """How far to the left of this axis it looks, rad."""
+        """Angle from this axis to the robot's heading, rad."""
         return float(self.pose[2] - QUARTER_TURN * self.facing_axis)
 
     @property
     def is_aligned(self) -> bool:
-        """Whether it is along this axis."""
+        """Whether the robot faces along this axis."""
         return abs(self.heading_error) <= ALIGNMENT_TOLERANCE
 
     @property
     def is_facing_ahead(self) -> bool:
-        """Whether it is along the axis along which it travels, and not on a turn."""
+        """Whether the robot faces along the axis of travel, and does not turn."""
         return self.facing_axis == self.travel_axis and self.is_aligned
 
     @property
     def direction(self) -> Float64:
-        """Unit vector along the hallway, as the robot travels, shape (2,)."""
+        """Unit vector in the direction of travel, shape (2,)."""
         return _unit_vector(self.travel_axis)
 
     @property
     def left_normal(self) -> Float64:
-        """Unit vector across it, shape (2,)."""
+        """Unit vector to the left of it, shape (2,)."""
         return _unit_vector(self.travel_axis + 1)
 
     @property
     def distance_past_node(self) -> float:
-        """How far the robot is beyond its last node in its direction of travel, m."""
+        """Distance from the last node to the robot in the direction of travel, m."""
         assert self.last_node is not None
         return float((self.position - self.last_node.position) @ self.direction)
 
     @property
     def lateral_offset(self) -> float:
-        """How far the robot is to the right of the hallway's middle, m."""
+        """Distance from the hallway's middle to the robot, to the right, m."""
         return float((self.hallway_center - self.position) @ self.left_normal)
 
     @property
     def last_node_position(self) -> Float64:
-        """The place of the last node, or where the robot is before the first one, m, shape (2,)."""
+        """Position of the last node, or of the robot before the first one, m, shape (2,)."""
         return self.position if self.last_node is None else self.last_node.position
 
-    def is_near(self, place: Float64 | None, distance: float) -> bool:
-        """Whether the robot is so near to a place that it was at, m; wheels that stand and roll tell of ways, too."""
-        return place is not None and math.dist(self.position, place) <= distance
+    def is_near(self, point: Float64 | None, distance: float) -> bool:
+        """Whether the robot is within a distance, m, of a point (2,); False for None."""
+        return point is not None and math.dist(self.position, point) <= distance
 
     def coordinate_along(self, axis: int) -> float:
-        """How far the robot came along an axis, from anywhere, m."""
+        """Coordinate of the robot along an axis, m."""
         return float(self.position @ _unit_vector(axis))
 
     def free_distance(self, quarters: int) -> float:
-        """How far one sees so many quarters to the right of the direction of travel, m; nan where no beam tells."""
-        return float(
-            self._sector_distances[
-                sector_indices(np.array(QUARTER_TURN * (self.travel_axis - quarters) - self.pose[2]))
-            ]
-        )
+        """Free distance some quarters to the right of the direction of travel, m; nan without a beam there."""
+        bearing = np.array(QUARTER_TURN * (self.travel_axis - quarters) - self.pose[2])
+        return float(self._sector_distances[sector_indices(bearing)])
 
     def center_point_ahead(self, distance: float) -> Float64:
-        """The place in the hallway's middle so far ahead of the robot, m, shape (2,)."""
+        """The point in the hallway's middle at a distance ahead of the robot, m, shape (2,)."""
         return np.asarray(self.position + distance * self.direction + self.lateral_offset * self.left_normal)
 
     def center_point_ahead_in_base(self, distance: float) -> Float64:
-        """The same place in the frame of the base."""
+        """The same point in the frame of the base."""
         return self._to_base_frame(self.center_point_ahead(distance))
 
     def node_line_point_in_base(self, axis: int, distance: float) -> Float64:
-        """The place so far ahead of the robot, m, on the line along an axis through its last node; likewise."""
+        """The point ahead of the robot on the line along an axis through its last node, m, frame of the base."""
         node, along = self.last_node_position, _unit_vector(axis)
         return self._to_base_frame(node + (float((self.position - node) @ along) + distance) * along)
 
     def node_offset_point_in_base(self, axis: int, distance: float) -> Float64:
-        """The place so far from the last node along an axis, m; likewise."""
+        """The point at a distance from the last node along an axis, m, frame of the base."""
         return self._to_base_frame(self.last_node_position + distance * _unit_vector(axis))
 
-    def _to_base_frame(self, place: Float64) -> Float64:
-        return np.asarray(se2.transform(se2.inverse(self.pose), place[None])[0])
+    def _to_base_frame(self, point: Float64) -> Float64:
+        return np.asarray(se2.transform(se2.inverse(self.pose), point[None])[0])
 
     @property
     def has_hallway_in_view(self) -> bool:
-        """Whether what is free around the robot is a hallway along the axis along which it looks."""
+        """Whether the free space around the robot is a hallway along the axis that it faces."""
         space, right = space_from_distances(self._sector_distances), self.travel_axis - self.facing_axis
-        chord = self.free_distance(right) + self.free_distance(right - 2)
-        return space is not None and hallway_log_odds(space, self._features) > 0.0 and chord >= _LONG * space.length
+        if space is None or hallway_log_odds(space, self._features) <= 0.0:
+            return False
+        return self.free_distance(right) + self.free_distance(right - 2) >= _MIN_CHORD_SHARE * space.length
 
     def update_hallway_center(self, lines: Lines) -> None:
-        """The middle of the hallway along which the robot looks, where both walls are in sight."""
+        """Measure the middle of the hallway that the robot faces along, where both walls are visible."""
         left, right = (
             distance_to_wall_beside(lines, QUARTER_TURN * side - self.pose[2])
             for side in (self.facing_axis + 1, self.facing_axis - 1)

@@ -1,37 +1,35 @@
-"""The observation function OS(o, s): how probable is an observation graph in a state.
+"""The observation function OS(o, s): the likelihood of an observation graph in a state.
 
-Tomatis, Nourbakhsh and Siegwart (2003), section 3.3, Eq. (1); the paper does not say how OS is computed. Here o is a
-finite set of landmarks, and OS its density under this model, track by track (observation_graph.py), each independent:
+Tomatis, Nourbakhsh and Siegwart (2003), section 3.3, Eq. (1), do not define OS. Here o is a finite set of landmarks,
+and OS its density under this model. The tracks (observation_graph.py) are independent:
 
-- The robot is ``delta`` beyond where it is taken to be along the axis, delta ~ N(0, tau^2).
-- Landmark i of the map, at x_i - delta, is extracted within reach with probability q_i = p_lmap p_det P(within reach).
-  Within reach of a convex corner is the robot only on the side of it to which that looks, where both of its walls are
-  in sight. It is then measured at N(x_i - delta, .), with a form (heading or width) of N(f_i, .): together g_ij.
-- What is not in the map is a Poisson process over the reach: landmarks of density lambda_new, and such that are none,
-  of density lambda_false. Forms are uniform there, of density u.
-- Confidences p_l are calibrated: among all extracted landmarks they have some density h of mean pi, and are the
-  probability of being there. By Bayes those that are there have the density h p_l / pi, the others h (1 - p_l) /
-  (1 - pi).
+- The position along the axis has an error delta ~ N(0, tau^2).
+- Landmark i of the map, at x_i - delta, is extracted with probability q_i = p_lmap p_det P(within reach). A convex
+  corner is within reach only on the side that it faces, from which both of its walls are visible. Its measurement is
+  N(x_i - delta, .), with a form (heading or width) of N(f_i, .): together g_ij.
+- Landmarks that the map lacks are a Poisson process over the reach, of density lambda_new for true landmarks and of
+  lambda_false for false ones. Their forms are uniform, of density u.
+- Confidences p_l are calibrated: their density h over all extracted landmarks has the mean pi. By Bayes, true
+  landmarks have the density h p_l / pi, and false ones h (1 - p_l) / (1 - pi).
 
-So what is extra has e_j = u [lambda_false (1 - p_l,j) / (1 - pi) + lambda_new p_l,j / pi], and
+So an unmatched landmark has e_j = u [lambda_false (1 - p_l,j) / (1 - pi) + lambda_new p_l,j / pi], and
 
     OS(o, s) = h's exp(-Lambda) prod_j e_j  E_delta[ sum_A prod_missed (1 - q_i) prod_matched q_i g_ij p_l,j / (pi e_j)]
 
-over all pairings A of expected with observed landmarks of which none crosses another one. What stands before E is the
-same in all states, is the density of o where the map expects nothing, and is left out: the functions here return the
-logarithm of the *ratio* E. The sum is that of a forward algorithm in O(n m), exact for the tracks; E over delta is a
-sum over a grid whose weights add up to 1, which is a model itself.
+over all pairings A of expected with observed landmarks that do not cross. The factor before E, the density of o where
+the map expects nothing, is the same in all states. It is left out: the functions here return the logarithm of the
+*ratio* E. The sum is a forward algorithm in O(n m), exact for each track. E over delta is a sum over a grid.
 
-Integrated over all o, OS gives the probability that no two landmarks of a track are measured in the wrong order:
-1 where they lie apart by several deviations, as the two jambs of a door do, and less where they do not. There, the
-map holds as two what can hardly be told from one.
+Integrated over all o, OS is the probability that the landmarks of a track are measured in their order. It is 1 where
+they are several deviations apart, as two jambs of a door are.
 
-Unknown ground shows landmarks of density lambda_usual, a Poisson process too.
+In unknown ground landmarks are a Poisson process of density lambda_usual.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,22 +38,33 @@ from numba import njit
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
 from hmt_slam_ros.geometry.se2 import wrap_by_modulus
-from hmt_slam_ros.places.observation_graph import CONVEX, OPENINGS, TRACKS, LandmarkSequence, select_landmarks
+from hmt_slam_ros.places.observation_graph import (
+    CONVEX,
+    OPENINGS,
+    TRACKS,
+    LandmarkSequence,
+    concatenate_sequences,
+    select_landmarks,
+)
 
-# Beyond so many deviations nothing is matched, and a landmark is not within reach.
 _MAX_DEVIATIONS = 9.0
-# The grid over the robot's place: so many of its deviations to both sides, in steps of so much of a landmark's.
-_SIDES, _STEP = 4.0, 0.5
+"""Deviations beyond which no pair is matched, and no landmark is within reach."""
+
+_SIDES = 4.0
+"""Half width of the grid over the position error, in deviations of that error."""
+
+_STEP = 0.5
+"""Largest step of that grid, in deviations of a landmark's position."""
 
 
 class ObservationModel(NamedTuple):
-    """What is known of how landmarks are seen.
+    """Parameters of the observation function.
 
     :ivar reach: m.
     :ivar detection: p_det.
-    :ivar position_variance: variance of a place along the axis beyond what map and measurement say, m^2.
-    :ivar heading_variance: that of a corner's heading, rad^2.
-    :ivar width_variance: that of an opening's width, m^2.
+    :ivar position_variance: of a position along the axis, beyond those of map and measurement, m^2.
+    :ivar heading_variance: of a corner's heading, likewise, rad^2.
+    :ivar width_variance: of an opening's width, likewise, m^2.
     :ivar false_density: lambda_false, 1/m.
     :ivar new_density: lambda_new, 1/m.
     :ivar usual_density: lambda_usual, 1/m.
@@ -78,18 +87,28 @@ class ObservationModel(NamedTuple):
 
 
 class ExpectedLandmarks(NamedTuple):
-    """What is to be seen in every state.
+    """The expected landmarks of every state.
 
-    :ivar starts: shape (states + 1,), where the list of each state begins.
-    :ivar landmarks: the lists, one after the other, each as from the state's node.
+    :ivar starts: shape (states + 1,), the first row of each state.
+    :ivar landmarks: of all states, one after the other, each as from the state's node.
     """
 
     starts: Int64
     landmarks: LandmarkSequence
 
+    def of_state(self, state: int) -> LandmarkSequence:
+        """The expected landmarks of one state."""
+        return select_landmarks(self.landmarks, slice(*self.starts[state : state + 2].tolist()))
+
+
+def stack_expected_landmarks(sequences: Sequence[LandmarkSequence]) -> ExpectedLandmarks:
+    """The expected landmarks of states, of one sequence for each."""
+    starts = np.cumsum([0, *(len(sequence.tracks) for sequence in sequences)])
+    return ExpectedLandmarks(starts, concatenate_sequences(sequences))
+
 
 def observation_model(places: PlaceParameters, features: FeatureParameters) -> ObservationModel:
-    """The model that parameters say."""
+    """The model of the parameters."""
     return ObservationModel(
         places.reach,
         places.detection,
@@ -112,9 +131,9 @@ def log_observation_ratios(
     variance: float,
     model: ObservationModel,
 ) -> Float64:
-    """Log-likelihood ratios log OS(o, s) of all states against a place where nothing is expected, shape (states,).
+    """Log-likelihood ratios log OS(o, s) of all states against an empty map, shape (states,).
 
-    :param distance_past_node: how far the robot is beyond the state's node, m.
+    :param distance_past_node: from the state's node to the robot, m.
     :param variance: of that, m^2.
     """
     shifts, weights = _offset_grid(variance, model)
@@ -132,11 +151,10 @@ def estimate_distance_past_node(
     variance: float,
     model: ObservationModel,
 ) -> tuple[float, float]:
-    """How far the robot is beyond a state's node after what it observed, m, and the variance of that, m^2."""
+    """Distance from a state's node to the robot, given its observation, m, and the variance of that, m^2."""
     shifts, weights = _offset_grid(variance, model)
     tracks = np.searchsorted(observed.tracks, np.arange(TRACKS + 1))
-    own = select_landmarks(expected.landmarks, slice(*expected.starts[state : state + 2].tolist()))
-    alone = ExpectedLandmarks(np.array([0, len(own.tracks)]), own)
+    alone = stack_expected_landmarks([expected.of_state(state)])
     matched = _match_factors(observed, model)
     logs = np.array(
         [
@@ -153,23 +171,23 @@ def estimate_distance_past_node(
 
 
 def log_unknown_ground_ratio(observed: LandmarkSequence, model: ObservationModel) -> float:
-    """The same of unknown ground: one Poisson process against another."""
-    there = observed.probabilities / model.true_share
-    none = model.false_density * (1.0 - observed.probabilities) / (1.0 - model.true_share)
+    """Log-likelihood ratio of unknown ground against an empty map: of two Poisson processes."""
+    true = observed.probabilities / model.true_share
+    false = model.false_density * (1.0 - observed.probabilities) / (1.0 - model.true_share)
     more = (model.usual_density - model.new_density) * 2.0 * model.reach * TRACKS
-    return float(np.log((model.usual_density * there + none) / (model.new_density * there + none)).sum() - more)
+    return float(np.log((model.usual_density * true + false) / (model.new_density * true + false)).sum() - more)
 
 
 def _match_factors(observed: LandmarkSequence, model: ObservationModel) -> Float64:
-    """What a match counts, p_l / (pi e), shape (m,)."""
+    """Factor of a matched landmark, p_l / (pi e), shape (m,)."""
     form = np.where(observed.tracks < OPENINGS, model.corner_form, model.opening_form)
-    there = observed.probabilities / model.true_share
-    none = model.false_density * (1.0 - observed.probabilities) / (1.0 - model.true_share)
-    return there / (form * (none + model.new_density * there))
+    true = observed.probabilities / model.true_share
+    false = model.false_density * (1.0 - observed.probabilities) / (1.0 - model.true_share)
+    return true / (form * (false + model.new_density * true))
 
 
 def _offset_grid(variance: float, model: ObservationModel) -> tuple[Float64, Float64]:
-    """A grid over delta, m, and the weights of its points."""
+    """Grid over delta, m, and the weights of its points."""
     deviation = math.sqrt(variance)
     count = math.ceil(_SIDES * deviation / (_STEP * math.sqrt(model.position_variance)))
     if not count:
@@ -185,18 +203,18 @@ def _log_ratios(
     tracks: Int64,
     matched: Float64,
     expected: ExpectedLandmarks,
-    aways: Float64,
+    offsets: Float64,
     weights: Float64,
     model: ObservationModel,
 ) -> Float64:
     states = len(expected.starts) - 1
-    logs, found = np.empty(len(aways)), np.empty(states)
+    logs, found = np.empty(len(offsets)), np.empty(states)
     row = np.empty(len(observed.positions) + 1)
     for state in range(states):
         begin, end = expected.starts[state], expected.starts[state + 1]
-        for k in range(len(aways)):
+        for k in range(len(offsets)):
             logs[k] = math.log(weights[k])
-            logs[k] += _log_pairings(observed, tracks, matched, expected.landmarks, begin, end, aways[k], model, row)
+            logs[k] += _log_pairings(observed, tracks, matched, expected.landmarks, begin, end, offsets[k], model, row)
         top = logs.max()
         found[state] = top + math.log(np.exp(logs - top).sum()) if top > -np.inf else -np.inf
     return found
@@ -210,17 +228,17 @@ def _log_pairings(
     landmarks: LandmarkSequence,
     begin: int,
     end: int,
-    away: float,
+    offset: float,
     model: ObservationModel,
     row: Float64,
 ) -> float:
-    """Log of the sum over all pairings, the product over the tracks."""
+    """Log of the sum over all pairings of a state, (1,)."""
     total, own = 0.0, begin
     for track in range(TRACKS):
         first, count = tracks[track], tracks[track + 1] - tracks[track]
         row[: count + 1] = 1.0
         while own < end and landmarks.tracks[own] == track:
-            total += _forward_step(observed, matched, landmarks, own, first, count, away, model, row)
+            total += _forward_step(observed, matched, landmarks, own, first, count, offset, model, row)
             own += 1
         total += math.log(row[count]) if row[count] > 0.0 else -np.inf
     return total
@@ -234,16 +252,16 @@ def _forward_step(
     own: int,
     first: int,
     count: int,
-    away: float,
+    offset: float,
     model: ObservationModel,
     row: Float64,
 ) -> float:
-    """Take one more expected landmark into the sums over pairings of it and those before; return what was scaled off.
+    """Add one expected landmark to the sums over pairings, and return the log of the scale taken from them.
 
-    ``row[j]`` is the sum over the pairings with the first j observed landmarks of the track, of which the others are
-    extra. The new one is missed, or matched with any of them.
+    ``row[j]`` is the sum over the pairings with the first j observed landmarks of the track. The added one is missed,
+    or matched with any of them.
     """
-    place, variance = landmarks.positions[own] - away, landmarks.variances[own, 0] + model.position_variance
+    place, variance = landmarks.positions[own] - offset, landmarks.variances[own, 0] + model.position_variance
     form_variance = landmarks.variances[own, 1] + (
         model.heading_variance if landmarks.tracks[own] < OPENINGS else model.width_variance
     )
@@ -272,16 +290,16 @@ def _forward_step(
 
 
 @njit(cache=True)
-def _gaussian_density(off: float, variance: float) -> float:
-    """Density of a difference; 0 far out."""
-    if off * off > _MAX_DEVIATIONS * _MAX_DEVIATIONS * variance:
+def _gaussian_density(difference: float, variance: float) -> float:
+    """Gaussian density of a difference, 0 beyond `_MAX_DEVIATIONS`."""
+    if difference * difference > _MAX_DEVIATIONS * _MAX_DEVIATIONS * variance:
         return 0.0
-    return math.exp(-0.5 * off * off / variance) / math.sqrt(2.0 * math.pi * variance)
+    return math.exp(-0.5 * difference * difference / variance) / math.sqrt(2.0 * math.pi * variance)
 
 
 @njit(cache=True)
 def visible_interval(track: int, form: float, reach: float) -> tuple[float, float]:
-    """From where to where ahead of the robot a landmark is in sight, m.
+    """Smallest and largest position ahead of the robot at which a landmark is visible, m.
 
     :param form: as of `LandmarkSequence`.
     """
@@ -292,7 +310,7 @@ def visible_interval(track: int, form: float, reach: float) -> tuple[float, floa
 
 @njit(cache=True)
 def _probability_between(place: float, deviation: float, low: float, high: float) -> float:
-    """Probability that a landmark is measured between two places."""
+    """Probability that a landmark is measured between two positions."""
     if low + _MAX_DEVIATIONS * deviation < place < high - _MAX_DEVIATIONS * deviation:
         return 1.0
     if not low - _MAX_DEVIATIONS * deviation <= place <= high + _MAX_DEVIATIONS * deviation:

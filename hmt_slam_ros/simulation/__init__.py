@@ -1,6 +1,6 @@
-"""A simulated world with ground truth: buildings, a robot that drives through them, and what it measures."""
+"""Simulation with ground truth: buildings, a robot that drives through them, and its measurements."""
 
-from hmt_slam_ros.simulation.families import FAMILIES
 from hmt_slam_ros.simulation.simulated_log import SimulatedLog, open_simulated
+from hmt_slam_ros.simulation.worlds import FAMILIES
 
 __all__ = ["FAMILIES", "SimulatedLog", "open_simulated"]

@@ -1,4 +1,4 @@
-"""Buildings: walls, furniture, and the way that the robot drives through them."""
+"""Buildings: walls, furniture, route and topological states, and floor plans that make them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 
-_DECIMALS = 3  # of metres: corners meant to be the same are the same
+_DECIMALS = 3
+"""Decimals of coordinates in m, so that equal corners are equal numbers."""
 
 
 def outline_of_cells(
     inside: NDArray[np.bool_], xs: NDArray[np.float64], ys: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The segments between cells that are inside and cells that are not, as long as they go straight on.
+    """The longest straight segments between inside and outside cells.
 
-    :param inside: shape (rows, columns); what lies beyond the grid is not inside.
+    :param inside: shape (rows, columns); cells beyond the grid are outside.
     :param xs: shape (columns + 1,), x of the cells' sides, m, increasing.
     :param ys: shape (rows + 1,), y of the cells' sides, m, increasing.
     :returns: shape (n, 4), x and y of both ends, m.
@@ -33,7 +34,7 @@ def outline_of_cells(
 def outline_of_rectangles(rectangles: NDArray[np.float64]) -> NDArray[np.float64]:
     """The outline of the union of rectangles.
 
-    :param rectangles: shape (n, 4), smallest x and y, largest x and y, m; to the millimetre.
+    :param rectangles: shape (n, 4), smallest x and y, largest x and y, m; to the millimeter.
     :returns: shape (k, 4), x and y of both ends, m.
     """
     corners = np.round(rectangles, _DECIMALS)
@@ -47,7 +48,7 @@ def outline_of_rectangles(rectangles: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def _runs(marked: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Row, first column and column behind the last of every run of marked cells."""
+    """Row, first column and end column of every run of marked cells."""
     changes = np.diff(np.pad(marked.astype(np.int8), ((0, 0), (1, 1))), axis=1)
     rows, begin = np.nonzero(changes == 1)
     return rows, begin, np.nonzero(changes == -1)[1]
@@ -65,15 +66,15 @@ def _no_doors() -> NDArray[np.float64]:
 
 
 class TopologicalStates(NamedTuple):
-    """Where a robot in the hallways passes what topological localization has to tell apart.
+    """The true states of topological localization: open doors and crossings.
 
-    After Tomatis, Nourbakhsh and Siegwart (2003), section 2.1: openings from a hallway to an open room, and crossings.
+    After Tomatis, Nourbakhsh and Siegwart (2003), section 2.1.
 
-    :ivar poses: shape (s, 3), in the middle of a hallway, looking through the opening to its side, m and rad; at a
-        crossing where both hallways meet, looking along the one that ends there.
-    :ivar ahead: shape (s,), from there to the opening in the hallway's side, m.
+    :ivar poses: shape (s, 3), in the middle of a hallway, facing the opening to its side, m and rad; at a crossing in
+        the middle of both hallways, facing along the one that ends there.
+    :ivar ahead: shape (s,), distance to the opening in the hallway's side, m.
     :ivar widths: shape (s,), of the openings, m.
-    :ivar crossings: shape (s,), whether it is a crossing of hallways; else it is an open room's door.
+    :ivar crossings: shape (s,), whether it is a crossing; else the door of an open room.
     """
 
     poses: NDArray[np.float64]
@@ -83,7 +84,7 @@ class TopologicalStates(NamedTuple):
 
     @property
     def openings(self) -> NDArray[np.float64]:
-        """The middles of the openings, shape (s, 3), m, each with the heading through it, rad."""
+        """Poses of the openings, shape (s, 3): their middle, m, and the heading through them, rad."""
         zeros = np.zeros_like(self.ahead)
         return se2.compose(self.poses, np.stack((self.ahead, zeros, zeros), axis=1))
 
@@ -94,15 +95,15 @@ def _no_states() -> TopologicalStates:
 
 @dataclass(frozen=True, eq=False)
 class Building:
-    """A world for one robot; all in one frame, m and rad.
+    """A simulated world, in one frame, m and rad.
 
     :ivar walls: shape (n, 4), x and y of both ends of each wall.
-    :ivar route: shape (k, 2), way-points of the robot, k >= 2; the same one first and last for a closed route.
-    :ivar furniture: shape (m, 5), x, y, heading, length and width of each piece that may be moved.
-    :ivar doors: shape (d, 4), x and y of both ends of each door that may be closed; they are open.
-    :ivar rooms: shape (r, 5), likewise x, y, heading, length and width of each room beside the corridors that is open.
-    :ivar twin_frames: {name: shape (3,)}, frames in which parts of the building that are the same look the same.
-    :ivar states: the topological states of the hallways, of a building in which they are counted.
+    :ivar route: shape (k, 2), way-points of the robot, k >= 2; the first and the last are equal for a closed route.
+    :ivar furniture: shape (m, 5), x, y, heading, length and width of each movable piece.
+    :ivar doors: shape (d, 4), x and y of both ends of each open door that later visits may find closed.
+    :ivar rooms: shape (r, 5), x, y, heading, length and width of each open room beside the corridors.
+    :ivar twin_frames: {name: shape (3,)}, frames in which identical parts of the building have equal coordinates.
+    :ivar states: the topological states of the hallways, where the family has them.
     """
 
     walls: NDArray[np.float64]
@@ -114,16 +115,15 @@ class Building:
     states: TopologicalStates = field(default_factory=_no_states)
 
     def transform(self, pose: NDArray[np.float64]) -> Building:
-        """The same building, its origin at a pose (3,)."""
+        """The building moved to a pose (3,) of its origin."""
         pieces, rooms = (
-            np.concatenate((se2.compose(pose, own[:, :3]), own[:, 3:]), axis=1) for own in (self.furniture, self.rooms)
+            np.concatenate((se2.compose(pose, rows[:, :3]), rows[:, 3:]), axis=1)
+            for rows in (self.furniture, self.rooms)
         )
-        places = {name: se2.compose(pose, place) for name, place in self.twin_frames.items()}
+        frames = {name: se2.compose(pose, frame) for name, frame in self.twin_frames.items()}
         states = self.states._replace(poses=se2.compose(pose, self.states.poses))
-        route = se2.transform(pose, self.route)
-        return Building(
-            _transform_lines(pose, self.walls), route, pieces, _transform_lines(pose, self.doors), rooms, places, states
-        )
+        walls, doors = _transform_lines(pose, self.walls), _transform_lines(pose, self.doors)
+        return Building(walls, se2.transform(pose, self.route), pieces, doors, rooms, frames, states)
 
 
 def _transform_lines(pose: NDArray[np.float64], lines: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -140,9 +140,9 @@ def furniture_walls(pieces: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Side(NamedTuple):
-    """One side of a corridor in a floor plan: along it and out of it, in steps of right angles.
+    """One side of a corridor in a floor plan, along the x or the y axis.
 
-    :ivar origin: where it begins, m.
+    :ivar origin: its begin, m.
     :ivar along: unit vector along it.
     :ivar out: unit vector away from the corridor.
     """
@@ -152,49 +152,48 @@ class Side(NamedTuple):
     out: Point
 
     def point(self, along: float, out: float) -> Point:
-        """A point by its distances from the side's begin, m."""
+        """A point by its distances from the side's origin, m."""
         return (
             self.origin[0] + along * self.along[0] + out * self.out[0],
             self.origin[1] + along * self.along[1] + out * self.out[1],
         )
 
     def rectangle(self, along: Point, out: Point) -> tuple[float, float, float, float]:
-        """The rectangle between two distances along and two out of the side, m, as `FloorPlan.cut_rectangle` takes
-        it."""
+        """The rectangle between two distances along and two out of the side, m, for `FloorPlan.cut_rectangle`."""
         (ax, ay), (bx, by) = self.point(along[0], out[0]), self.point(along[1], out[1])
         return min(ax, bx), min(ay, by), max(ax, bx), max(ay, by)
 
 
 class FloorPlan:
-    """A floor plan that is made by cutting free rectangles out of solid stone; they may overlap."""
+    """A floor plan: the union of free rectangles."""
 
     def __init__(self) -> None:
         self._rectangles: list[tuple[float, float, float, float]] = []
 
     def cut_rectangle(self, x0: float, y0: float, x1: float, y1: float) -> None:
-        """Cut out a rectangle, m."""
+        """Add a free rectangle, m."""
         self._rectangles.append((x0, y0, x1, y1))
 
     def cut_corridor(self, start: Point, end: Point, width: float) -> None:
-        """Cut out a corridor along the x or the y axis; its ends are half a width beyond both points of its middle."""
+        """Add a corridor along the x or the y axis, half a width longer than its middle line at both ends, m."""
         (x0, x1), (y0, y1) = sorted((start[0], end[0])), sorted((start[1], end[1]))
         self.cut_rectangle(x0 - 0.5 * width, y0 - 0.5 * width, x1 + 0.5 * width, y1 + 0.5 * width)
 
     def cut_ring(self, half_x: float, half_y: float, width: float) -> None:
-        """Cut out a ring of corridors around the origin; its middle is a rectangle of the half sides given."""
+        """Add a ring of corridors around the origin, with a middle line of these half sides, m."""
         corners = [(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)]
         for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
             self.cut_corridor(start, end, width)
 
     def walls(self) -> NDArray[np.float64]:
-        """The walls around all that is free, shape (n, 4), m."""
+        """The outline of the free space, shape (n, 4), m."""
         return outline_of_rectangles(np.array(self._rectangles))
 
 
 def sides_of_ring(half_x: float, half_y: float, width: float, *, outer: bool) -> list[Side]:
-    """The four outer or inner sides of a ring as `FloorPlan.cut_ring` makes it, counter-clockwise from the lower one.
+    """The four outer or inner sides of a ring (`FloorPlan.cut_ring`), counterclockwise from the lower one.
 
-    Each begins at its corner; the lengths are 2 half_x and 2 half_y in turn, plus or minus a width.
+    Their lengths are 2 half_x and 2 half_y in turn, plus or minus a width.
     """
     away = 0.5 * width if outer else -0.5 * width
     x, y = half_x + away, half_y + away

@@ -1,4 +1,4 @@
-"""Families of buildings made of corridors, and those with halls larger than the laser's reach."""
+"""Families of buildings with corridors, rooms and halls."""
 
 from __future__ import annotations
 
@@ -14,30 +14,46 @@ from hmt_slam_ros.simulation.furniture import Rectangle, furnish
 from hmt_slam_ros.simulation.settings import Settings
 
 WALL = 0.2
-"""Between two rooms, m."""
+"""Thickness of walls, m."""
 
-_OVERLAP = 0.05  # m, by which an opening reaches into what it opens to
+_OVERLAP = 0.05
+"""Overlap of an opening with the free space on both of its sides, m."""
+
+_OPEN_PROBABILITY = 0.6
+"""Probability that the door of an office is open."""
+
+_TWIN_ROOM = 4.0
+"""Side of a twin room, m."""
+
+_TWIN_OFFSET = 4.5
+"""Distance of each twin's door from the middle of the wall, m."""
+
+_TWIN_HALF_DOOR = 0.55
+"""Half the width of a twin's door, m."""
+
+_TWIN_PASSAGE = 2.0
+"""Width of the passage behind the twins, m."""
 
 
 class Ring(NamedTuple):
-    """The middle of a ring of corridors around the origin: half sides, m."""
+    """The middle line of a ring of corridors around the origin, by its half sides, m."""
 
     half_x: float
     half_y: float
 
     @property
     def length(self) -> float:
-        """Once around, m."""
+        """Length of the middle line, m."""
         return 4.0 * (self.half_x + self.half_y)
 
     @property
     def corners(self) -> list[float]:
-        """Where the corners are behind the first, (-half_x, -half_y), counter-clockwise, m."""
+        """Distances of the corners from the first, (-half_x, -half_y), counterclockwise, m."""
         x, y = 2.0 * self.half_x, 2.0 * self.half_y
         return [x, x + y, 2.0 * x + y, 2.0 * (x + y)]
 
     def point(self, along: float) -> Point:
-        """The point some way behind the first corner, counter-clockwise, m."""
+        """The point at a distance from the first corner, counterclockwise, m."""
         along %= self.length
         x, y = self.half_x, self.half_y
         first, second, third, _ = self.corners
@@ -50,19 +66,19 @@ class Ring(NamedTuple):
         return -x, y - (along - third)
 
     def waypoints(self, start: float, end: float) -> list[Point]:
-        """Way-points counter-clockwise from one place to a later one, the first corner being at 0; m."""
+        """Way-points between two distances from the first corner, counterclockwise, m."""
         laps = range(int(start // self.length), int(end // self.length) + 1)
         corners = [lap * self.length + corner for lap in laps for corner in self.corners]
         return [self.point(along) for along in (start, *(c for c in corners if start < c < end), end)]
 
 
 class Plot(NamedTuple):
-    """Where a room and its door are to be, along one side of a corridor, m.
+    """A room and its door along one side of a corridor, m.
 
     :ivar begin: of the room.
     :ivar end: of the room.
     :ivar depth: of the room.
-    :ivar left: where its door begins.
+    :ivar left: begin of its door.
     :ivar door: width of the door.
     """
 
@@ -76,11 +92,11 @@ class Plot(NamedTuple):
 class Room(NamedTuple):
     """A room beside a corridor.
 
-    :ivar floor: its rectangle.
-    :ivar along: where its door is on the corridor's side, m.
-    :ivar front: in the corridor's middle before the door.
-    :ivar inside: where a visitor turns back.
-    :ivar is_open: whether the door is.
+    :ivar floor: its rectangle, m.
+    :ivar along: position of its door along the corridor's side, m.
+    :ivar front: point in the corridor's middle before the door, m.
+    :ivar inside: point in the room where a robot turns back, m.
+    :ivar is_open: whether the door is open.
     :ivar door: x and y of both ends of the door, m.
     """
 
@@ -106,13 +122,13 @@ def cut_rooms(
     while (end := begin + draw.uniform(3.0, 5.5)) <= length - WALL:
         depth, door = draw.uniform(*depths), draw.uniform(0.9, 1.1)
         plot = Plot(begin, end, depth, draw.uniform(begin + 0.4, end - 0.4 - door), door)
-        rooms.append(cut_room(plan, side, plot, width, is_open=bool(draw.random() < 0.6)))
+        rooms.append(cut_room(plan, side, plot, width, is_open=bool(draw.random() < _OPEN_PROBABILITY)))
         begin = end + WALL
     return rooms
 
 
 def cut_room(plan: FloorPlan, side: Side, plot: Plot, width: float, *, is_open: bool) -> Room:
-    """Cut a room with its door out of one side of a corridor; of a closed one, the niche before its door.
+    """Cut a room with its door out of one side of a corridor; of a closed one only the niche of its door.
 
     :param width: of the corridor, m.
     """
@@ -122,13 +138,13 @@ def cut_room(plan: FloorPlan, side: Side, plot: Plot, width: float, *, is_open: 
         plan.cut_rectangle(*floor)
     plan.cut_rectangle(*side.rectangle((left, right), (-_OVERLAP, WALL + _OVERLAP if is_open else 0.4 * WALL)))
     middle = left + 0.5 * plot.door
-    leaf = (*side.point(left, 0.5 * WALL), *side.point(right, 0.5 * WALL))
+    door = (*side.point(left, 0.5 * WALL), *side.point(right, 0.5 * WALL))
     inside = side.point(middle, WALL + 0.5 * plot.depth)
-    return Room(floor, middle, side.point(middle, -0.5 * width), inside, is_open, leaf)
+    return Room(floor, middle, side.point(middle, -0.5 * width), inside, is_open, door)
 
 
 def cut_niches(draw: np.random.Generator, plan: FloorPlan, side: Side, length: float) -> None:
-    """Cut niches out of one side of a corridor, some metres apart, no two alike."""
+    """Cut random niches out of one side of a corridor, some meters apart."""
     begin = draw.uniform(1.5, 6.0)
     while (end := begin + draw.uniform(0.5, 1.5)) <= length - 1.5:
         plan.cut_rectangle(*side.rectangle((begin, end), (-_OVERLAP, draw.uniform(0.1, 0.4))))
@@ -136,7 +152,7 @@ def cut_niches(draw: np.random.Generator, plan: FloorPlan, side: Side, length: f
 
 
 def office(draw: np.random.Generator, settings: Settings) -> Building:
-    """Offices on both sides of a ring of corridors; the robot looks into some of them."""
+    """Offices on both sides of a ring of corridors; the robot enters some of them."""
     ring = Ring(settings.size * draw.uniform(10.0, 14.0), settings.size * draw.uniform(6.0, 8.0))
     width = draw.uniform(1.8, 2.4)
     plan = FloorPlan()
@@ -164,14 +180,14 @@ def office(draw: np.random.Generator, settings: Settings) -> Building:
 
 
 def doors_and_floors(rooms: Sequence[Room]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``doors`` (n, 4) and ``rooms`` (n, 5) of a `Building` with these open rooms."""
+    """``doors`` (n, 4) and ``rooms`` (n, 5) of a `Building` with some open rooms, m."""
     doors = np.array([room.door for room in rooms]).reshape(-1, 4)
     x0, y0, x1, y1 = np.array([room.floor for room in rooms]).reshape(-1, 4).T
     return doors, np.stack((0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0 * x0, x1 - x0, y1 - y0), axis=1)
 
 
 def nested(draw: np.random.Generator, settings: Settings) -> Building:
-    """Rings of corridors, one inside the other, joined below and above; each is driven around before the next."""
+    """Concentric rings of corridors, joined below and above; the robot completes each before the next."""
     unit, width = 8.0 * settings.size, 2.0
     rings = [Ring(1.3 * unit * (1 + k), 0.9 * unit * (1 + k)) for k in range(settings.count)]
     plan = FloorPlan()
@@ -181,7 +197,7 @@ def nested(draw: np.random.Generator, settings: Settings) -> Building:
             sides = sides_of_ring(*ring, width, outer=outer)
             for side, half in zip(sides, (ring.half_x, ring.half_y) * 2, strict=True):
                 cut_niches(draw, plan, side, 2.0 * half + (width if outer else -width))
-    # Where the passages leave each ring, from the middle of its sides, m.
+    # Positions of the passages from the middle of each ring's sides, m.
     below, above = (draw.uniform(-0.6, 0.6, len(rings)) * [ring.half_x for ring in rings] for _ in range(2))
     for k, (ring, next_ring) in enumerate(pairwise(rings)):
         plan.cut_corridor((below[k], -ring.half_y), (below[k], -next_ring.half_y), width)
@@ -190,14 +206,14 @@ def nested(draw: np.random.Generator, settings: Settings) -> Building:
 
 
 def _nested_route(rings: list[Ring], below: NDArray[np.float64], above: NDArray[np.float64]) -> list[Point]:
-    """Around each ring, out by the passages below, and from the outermost back in by those above."""
+    """The route around each ring, outwards by the passages below, and back inwards by those above."""
     route: list[Point] = []
     entry = 0.0
     for ring, leave in zip(rings, below.tolist(), strict=True):
         start = ring.half_x + entry
         out = ring.half_x + leave
         route += ring.waypoints(start, start + ring.length)
-        # The last ring has no passage to the outside; there the way goes on to the top.
+        # The last ring has no passage to the outside; its route goes on to the top.
         if ring is not rings[-1]:
             route += ring.waypoints(start, out) if out >= start else [ring.point(out)]
         entry = leave
@@ -212,7 +228,7 @@ def _nested_route(rings: list[Ring], below: NDArray[np.float64], above: NDArray[
 
 
 def grid(draw: np.random.Generator, settings: Settings) -> Building:
-    """Corridors that cross at equal distances, all alike; the robot strolls through them and returns."""
+    """Identical corridors that cross at equal distances; the robot takes a random walk and returns."""
     pitch, last = 9.0 * settings.size, settings.count
     plan = FloorPlan()
     for k in range(last + 1):
@@ -222,27 +238,27 @@ def grid(draw: np.random.Generator, settings: Settings) -> Building:
     crossings = [here]
     for _ in range(2 * (last + 1) ** 2):
         steps = [(here[0] + dx, here[1] + dy) for dx, dy in ((1, 0), (0, 1), (-1, 0), (0, -1))]
-        ways = [way for way in steps if way != before and max(way) <= last and min(way) >= 0]
-        here, before = ways[draw.integers(len(ways))], here
+        choices = [way for way in steps if way != before and max(way) <= last and min(way) >= 0]
+        here, before = choices[draw.integers(len(choices))], here
         crossings.append(here)
     crossings += [(0, here[1]), (0, 0)]
     return Building(plan.walls(), pitch * np.array(crossings, dtype=np.float64))
 
 
 def symmetric_ring(_draw: np.random.Generator, settings: Settings) -> Building:
-    """A square ring of corridors, each side like the others: a quarter turn changes nothing."""
+    """A square ring of corridors with four identical sides."""
     half, width = 7.0 * settings.size, 2.0
     plan = FloorPlan()
     plan.cut_ring(half, half, width)
     for side in sides_of_ring(half, half, width, outer=True):
         plan.cut_rectangle(*side.rectangle((half + 0.4, half + 1.6), (-_OVERLAP, 0.5)))
     quarter = 0.5 * np.pi
-    places = {f"side {k}": np.array([0.0, 0.0, k * quarter]) for k in range(4)}
-    return Building(plan.walls(), np.array(Ring(half, half).waypoints(half, 9.0 * half)), twin_frames=places)
+    frames = {f"side {k}": np.array([0.0, 0.0, k * quarter]) for k in range(4)}
+    return Building(plan.walls(), np.array(Ring(half, half).waypoints(half, 9.0 * half)), twin_frames=frames)
 
 
 def straight(draw: np.random.Generator, settings: Settings) -> Building:
-    """Two long halls with nothing in them, joined at both ends by short corridors with niches."""
+    """Two long empty corridors, joined at both ends by short ones with niches."""
     ring, width = Ring(25.0 * settings.size, 4.0), 2.5
     plan = FloorPlan()
     plan.cut_ring(*ring, width)
@@ -251,15 +267,8 @@ def straight(draw: np.random.Generator, settings: Settings) -> Building:
     return Building(plan.walls(), np.array(ring.waypoints(ring.half_x, ring.half_x + ring.length)))
 
 
-_ROOM = 4.0  # m, side of a twin room
-_OFF = 4.5  # m, from the middle of the wall to each twin's door
-_HALF_DOOR = 0.55  # m
-_WALL = 0.2  # m
-_BACK = 2.0  # m, width of the passage behind the twins
-
-
 def hall(draw: np.random.Generator, settings: Settings) -> Building:
-    """An open hall in whose middle the laser reaches no wall; the robot crosses it between two corners."""
+    """An open hall with walls out of reach from its middle; the robot crosses it between two corners."""
     half_x, half_y = 22.0 * settings.size, 18.0 * settings.size
     plan = FloorPlan()
     plan.cut_rectangle(-half_x, -half_y, half_x, half_y)
@@ -288,39 +297,41 @@ def hall(draw: np.random.Generator, settings: Settings) -> Building:
 
 
 def twins(draw: np.random.Generator, settings: Settings) -> Building:
-    """Two identical rooms side by side, and before them a hall so large that the robot loses count of where it is.
+    """Two identical rooms side by side, before a hall in which odometry drifts.
 
-    It goes through both rooms, from the hall and from the passage behind them, makes a tour of the hall, in which it
-    sees nothing, and enters one of the two again. Which one, the niches of the passage tell.
+    The robot passes both rooms, from the hall and from the passage behind them, makes a tour of the hall without any
+    wall in reach, and enters one of the two again. Only the niches of the passage tell which one.
     """
     depth = 68.0 * settings.size
     plan = FloorPlan()
-    plan.cut_rectangle(-_OFF - 9.0, 0.0, _OFF + 9.0, depth)
-    back = -_ROOM - 2.0 * _WALL
-    for x in (-_OFF, _OFF):
-        plan.cut_rectangle(x - 0.5 * _ROOM, -_WALL - _ROOM, x + 0.5 * _ROOM, -_WALL)
-        plan.cut_rectangle(x - _HALF_DOOR, back - 0.1, x + _HALF_DOOR, 0.1)
+    plan.cut_rectangle(-_TWIN_OFFSET - 9.0, 0.0, _TWIN_OFFSET + 9.0, depth)
+    back = -_TWIN_ROOM - 2.0 * WALL
+    for x in (-_TWIN_OFFSET, _TWIN_OFFSET):
+        plan.cut_rectangle(x - 0.5 * _TWIN_ROOM, -WALL - _TWIN_ROOM, x + 0.5 * _TWIN_ROOM, -WALL)
+        plan.cut_rectangle(x - _TWIN_HALF_DOOR, back - 0.1, x + _TWIN_HALF_DOOR, 0.1)
         # A niche on one side only, so that the room has no symmetry of its own.
-        plan.cut_rectangle(x + 0.5 * _ROOM - 0.1, -2.0, x + 0.5 * _ROOM + 0.4, -1.0)
-    plan.cut_rectangle(-_OFF - 5.0, back - _BACK, _OFF + 5.0, back)
-    cut_niches(draw, plan, Side((-_OFF - 5.0, back - _BACK), (1.0, 0.0), (0.0, -1.0)), 2.0 * _OFF + 10.0)
-    far, behind = depth - 8.0, back - 0.5 * _BACK
-    again = _OFF if draw.random() < 0.5 else -_OFF
+        plan.cut_rectangle(x + 0.5 * _TWIN_ROOM - 0.1, -2.0, x + 0.5 * _TWIN_ROOM + 0.4, -1.0)
+    plan.cut_rectangle(-_TWIN_OFFSET - 5.0, back - _TWIN_PASSAGE, _TWIN_OFFSET + 5.0, back)
+    passage = Side((-_TWIN_OFFSET - 5.0, back - _TWIN_PASSAGE), (1.0, 0.0), (0.0, -1.0))
+    cut_niches(draw, plan, passage, 2.0 * _TWIN_OFFSET + 10.0)
+    far, behind = depth - 8.0, back - 0.5 * _TWIN_PASSAGE
+    again = _TWIN_OFFSET if draw.random() < 0.5 else -_TWIN_OFFSET
     route = [
-        (-_OFF, 3.0),
-        (-_OFF, behind),
-        (_OFF, behind),
-        (_OFF, 3.0),
-        (_OFF, behind),
-        (-_OFF, behind),
-        (-_OFF, 8.0),
+        (-_TWIN_OFFSET, 3.0),
+        (-_TWIN_OFFSET, behind),
+        (_TWIN_OFFSET, behind),
+        (_TWIN_OFFSET, 3.0),
+        (_TWIN_OFFSET, behind),
+        (-_TWIN_OFFSET, behind),
+        (-_TWIN_OFFSET, 8.0),
         (0.0, 14.0),
         (0.0, far),
         (again, far),
         (again, behind),
         (-again, behind),
         (-again, 3.0),
-        (-_OFF, 3.0),
+        (-_TWIN_OFFSET, 3.0),
     ]
-    places = {name: np.array([x, 0.0, -0.5 * np.pi]) for name, x in (("first", -_OFF), ("second", _OFF))}
-    return Building(plan.walls(), np.array(route), twin_frames=places)
+    offsets = {"first": -_TWIN_OFFSET, "second": _TWIN_OFFSET}
+    frames = {name: np.array([x, 0.0, -0.5 * np.pi]) for name, x in offsets.items()}
+    return Building(plan.walls(), np.array(route), twin_frames=frames)

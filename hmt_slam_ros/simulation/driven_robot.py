@@ -1,4 +1,4 @@
-"""A robot in a simulated building that goes where it is told to, and stops at what is in its way."""
+"""A simulated robot that is driven by velocity commands, and stops before collisions."""
 
 from __future__ import annotations
 
@@ -15,47 +15,53 @@ from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.simulation.drive import ACCELERATION, TURN_ACCELERATION
+from hmt_slam_ros.simulation.drive import ACCELERATION, TURN_ACCELERATION, add_odometry_noise
 from hmt_slam_ros.simulation.laser import clearance
 from hmt_slam_ros.simulation.people import ReactivePeople
 from hmt_slam_ros.simulation.scenario import START, Scenario
-from hmt_slam_ros.simulation.wheels import add_odometry_noise
 
 COMMAND_TIMEOUT = 0.5
-"""So long a command holds, s; after that the robot stops."""
+"""Duration of a command, s; after that the robot stops."""
 
-_STEP = 0.02  # s, at most
+_STEP = 0.02
+"""Longest step, s."""
+
+_CONTACT_END = 0.05
+"""Distance beyond the radius at which a contact ends, m."""
+
 _SCRIPTED_ONLY = ("slips", "sweep", "moved", "carried")
-_OFF = 0.05  # m, from what it touched, where a contact is over
-_ROW = 5  # numbers that are kept of a step
+"""Settings of scripted drives alone."""
+
+_ROW = 5
+"""Numbers of the history per step: x, y, heading, speed and turn rate."""
 
 
 class DrivenRobot:
     """A disc that is driven by velocities through the building of a scenario.
 
-    It moves on arcs of constant velocity, each a step long, and its velocity follows the command as fast as
-    accelerations allow. A step that would bring it nearer to a wall, to furniture or to a person than its radius is not
-    gone, and it stands; it may turn on the spot wherever it is. Odometry and laser are those of the scripted drives,
-    with the same noise. One that drives where a scripted drive goes, with nobody about, measures the same at the scans.
+    It moves on arcs of constant velocity, one per step, and follows the command with limited accelerations. A step that
+    would bring a wall, furniture or a person within its radius is replaced by a stop; turns on the spot are always
+    possible. Odometry and laser have the noise of scripted drives: on the path of a scripted drive without people, the
+    measurements at the scans are the same.
 
-    :ivar scenario: the building, its people and the laser; the drive itself is not driven.
+    :ivar scenario: the building, its people and the laser; its drive is not used.
     :ivar pose: shape (3,), ``world_T_base`` now, m and rad.
     :ivar velocity: m/s and rad/s, now.
     :ivar stamp: now, ns.
-    :ivar contacts: how often it came upon something; before the next time it has to be 0.05 m away from everything.
+    :ivar contacts: number of contacts; one ends 0.05 m away from everything.
     :ivar distance_traveled: m.
     """
 
     def __init__(self, scenario: Scenario, start: NDArray[np.float64] | None = None) -> None:
-        """Put it down.
+        """Place the robot.
 
-        :param start: ``world_T_base`` (3,), where the scripted drive begins unless given.
-        :raises HmtSlamError: for settings that only scripted drives know.
+        :param start: ``world_T_base`` (3,); None for the start of the scripted drive.
+        :raises HmtSlamError: for settings of scripted drives alone.
         """
         settings = scenario.settings
         for name in _SCRIPTED_ONLY:
             if getattr(settings, name):
-                raise HmtSlamError(f"a robot that is driven by commands knows no {name}: set {name}=0")
+                raise HmtSlamError(f"a robot that is driven by commands has no setting {name}: set {name}=0")
         self.scenario = scenario
         self.pose = np.array(scenario.poses[0] if start is None else start, dtype=np.float64)
         self.velocity = (0.0, 0.0)
@@ -74,18 +80,17 @@ class DrivenRobot:
 
     @property
     def stamp(self) -> int:
-        """Time of the last odometry reading, ns."""
+        """Stamp of the last odometry reading, ns."""
         settings = self.scenario.settings
         return START + round(NANOSECONDS / (settings.rate * settings.readings) * self._reading)
 
     @property
     def people_discs(self) -> NDArray[np.float64]:
-        """Where people are now, shape (k, 3), x, y and radius, m."""
+        """People now, shape (k, 3), x, y and radius, m."""
         return self._walkers.discs
 
     def set_velocity(self, speed: float, turn_rate: float) -> None:
-        """Drive like this from now on, for `COMMAND_TIMEOUT` seconds unless told again; within the limits of the
-        settings.
+        """Command a velocity for `COMMAND_TIMEOUT` seconds, within the limits of the settings.
 
         :param speed: m/s, backwards below 0.
         :param turn_rate: rad/s, to the left.
@@ -96,7 +101,7 @@ class DrivenRobot:
         self._command_end = self._step + round(COMMAND_TIMEOUT / self._seconds)
 
     def kidnap(self, pose: NDArray[np.float64]) -> None:
-        """Put it elsewhere, standing; its wheels do not notice.
+        """Move the robot without odometry; it stands afterwards.
 
         :param pose: ``world_T_base`` (3,).
         """
@@ -111,7 +116,7 @@ class DrivenRobot:
         self._update_odometry()
 
     def measure(self) -> tuple[Odometry, Scan | None]:
-        """What wheels and laser say now; the laser not at every reading."""
+        """Odometry now, with a scan at every ``settings.readings``-th reading."""
         settings, stamp = self.scenario.settings, self.stamp
         number, between = divmod(self._reading, settings.readings)
         reading = Odometry(stamp, self._odometry)
@@ -122,29 +127,29 @@ class DrivenRobot:
         return reading, laser.scan(number, stamp, distances)
 
     def true_poses(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
-        """``world_T_base`` (n, 3), m and rad, at any stamps (n,) from the start until now, ns."""
+        """``world_T_base`` (n, 3), m and rad, at stamps (n,) from the start until now, ns."""
         past = np.append(np.array(self._history), (*self.pose, 0.0, 0.0)).reshape(-1, _ROW)
         steps = (stamps - START) / NANOSECONDS / self._seconds
-        # A stamp is a whole number of ns: one of a reading may be rounded to just before its step.
+        # Stamps are whole ns: one of a reading may be rounded to just before its step.
         whole = np.clip(np.floor(steps + 1e-6), 0, len(past) - 1).astype(np.int64)
         since = self._seconds * np.clip(steps - whole, 0.0, 1.0)
         twists = np.stack((since * past[whole, 3], 0.0 * since, since * past[whole, 4]), axis=1)
         return se2.compose(past[whole, :3], se2.exp(twists))
 
     def _advance_step(self) -> None:
-        """One step."""
-        told = self._command if self._step < self._command_end else (0.0, 0.0)
+        """Simulate one step."""
+        command = self._command if self._step < self._command_end else (0.0, 0.0)
         seconds = self._seconds
-        speed = self.velocity[0] + _clip(told[0] - self.velocity[0], ACCELERATION * seconds)
-        turn_rate = self.velocity[1] + _clip(told[1] - self.velocity[1], TURN_ACCELERATION * seconds)
+        speed = self.velocity[0] + _clip(command[0] - self.velocity[0], ACCELERATION * seconds)
+        turn_rate = self.velocity[1] + _clip(command[1] - self.velocity[1], TURN_ACCELERATION * seconds)
         moved = self._pose_after_step(speed, turn_rate)
-        free = self._clearances(moved)
-        radius, here = self.scenario.settings.radius, float(free[1])
-        if free[0] < min(radius, here):
+        after, before = self._clearances(moved).tolist()
+        radius = self.scenario.settings.radius
+        if after < min(radius, before):
             speed, moved = 0.0, self._pose_after_step(0.0, turn_rate)
             self.contacts += not self._is_in_contact
             self._is_in_contact = True
-        elif here > radius + _OFF:
+        elif before > radius + _CONTACT_END:
             self._is_in_contact = False
         self._history.extend((*self.pose.tolist(), speed, turn_rate))
         self.pose, self.velocity = moved, (speed, turn_rate)
@@ -157,27 +162,24 @@ class DrivenRobot:
         return se2.compose(self.pose, se2.exp(self._seconds * np.array([speed, 0.0, turn_rate])))
 
     def _clearances(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far the nearest surface is from its middle there and here, shape (2,), m."""
-        places = np.array([pose[:2], self.pose[:2]])
-        walls = clearance(self.scenario.surfaces.walls, places)
-        people = (
-            np.hypot(*(self.people_discs[None, :, :2] - places[:, None]).transpose(2, 0, 1)) - self.people_discs[:, 2]
-        )
+        """Distance of the nearest surface from a pose and from the present one, shape (2,), m."""
+        points, discs = np.array([pose[:2], self.pose[:2]]), self.people_discs
+        walls = clearance(self.scenario.surfaces.walls, points)
+        people = np.hypot(*(discs[None, :, :2] - points[:, None]).transpose(2, 0, 1)) - discs[:, 2]
         return np.minimum(walls, people.min(axis=1, initial=math.inf))
 
     def _update_odometry(self) -> None:
-        """Odometry at a reading: what is true since the last scan, and of the error of this draw the share until now.
+        """Update odometry at a reading by the true motion since the last scan, and a share of this scan's error.
 
-        As in the scripted drives the error grows evenly from scan to scan; until the next one is there, the motion is
-        taken to go on as since the last.
+        As in scripted drives, the error grows linearly from scan to scan. The motion to the next scan is extrapolated.
         """
         settings = self.scenario.settings
         passed = (self._reading - 1) % settings.readings + 1
         true, share = se2.between(self._pose_at_scan, self.pose), passed / settings.readings
         whole = true if share == 1.0 else se2.exp(se2.log(true) / share)
-        measured = (
-            add_odometry_noise(whole[None], settings.odometry, self._draw)[0] if settings.odometry > 0.0 else whole
-        )
+        measured = whole
+        if settings.odometry > 0.0:
+            measured = add_odometry_noise(whole[None], settings.odometry, self._draw)[0]
         if share < 1.0:
             error = se2.log(se2.between(whole, measured))
             measured = se2.compose(true, se2.exp(share * error))
@@ -188,11 +190,11 @@ class DrivenRobot:
 
 
 class DrivenLog:
-    """What a driven robot measures, as a log without an end: each record is made when it is asked for.
+    """The measurements of a driven robot as a log; each record is made when it is read.
 
     :ivar name: of the world.
-    :ivar scan_count: scans until its end, 0 where there is none.
-    :ivar duration: seconds until its end, 0 where there is none.
+    :ivar scan_count: scans until its end, 0 for no end.
+    :ivar duration: until its end, s, 0 for no end.
     """
 
     def __init__(self, name: str, robot: DrivenRobot, duration: float = 0.0) -> None:
@@ -202,7 +204,7 @@ class DrivenLog:
         self._robot = robot
 
     def records(self) -> Iterator[LogRecord]:
-        """All measurements from now on, each scan behind the odometry of the same stamp, with the truth."""
+        """All measurements from now on with true poses, each scan after the odometry of the same stamp."""
         robot, scans = self._robot, 0
         while True:
             reading, scan = robot.measure()

@@ -1,4 +1,4 @@
-"""Furniture: where it stands, and when it is moved while the robot does not see it."""
+"""Furniture: its placement, and moves between and during visits."""
 
 from __future__ import annotations
 
@@ -19,17 +19,26 @@ from hmt_slam_ros.simulation.settings import Settings
 
 Rectangle = tuple[float, float, float, float]
 
-_BERTH = 0.6  # m, between furniture and the robot's way
-_MOVE = np.array([0.7, 0.7, 0.5])  # deviation of a move, m, m, rad
+_MIN_DISTANCE_TO_ROUTE = 0.6
+"""Smallest distance of furniture from the robot's route, m."""
+
+_MOVE_DEVIATIONS = np.array([0.7, 0.7, 0.5])
+"""Deviations of a move, m, m, rad."""
+
 _TRIES = 10
-_LOOK = 0.5  # s, between two looks of the robot around
-_GAP = 5.0  # s, that nobody sees a piece while it is moved, at least
+"""Draws of a new pose for a piece, at most."""
+
+_SAMPLING_PERIOD = 0.5
+"""Time between two checks of what the robot sees, s."""
+
+_MIN_UNSEEN_TIME = 5.0
+"""Shortest time without sight of a piece in which it is moved, s."""
 
 
 class FurnitureSchedule(NamedTuple):
-    """Where the furniture stands over time.
+    """Poses of the furniture over time.
 
-    :ivar times: shape (k,), s, increasing from 0; at each one piece has been moved.
+    :ivar times: shape (k,), s, increasing from 0; at each one a piece has been moved.
     :ivar pieces: shape (k, m, 5), as in `Building`, from each of these times on.
     """
 
@@ -38,24 +47,24 @@ class FurnitureSchedule(NamedTuple):
 
 
 def furnish(draw: np.random.Generator, rooms: Sequence[Rectangle], route: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Put up to four pieces into every room, each along a wall and out of the way.
+    """Draw up to four pieces for every room, each along a wall and off the route.
 
     :param rooms: smallest x and y, largest x and y, m.
     :param route: shape (k, 2), m.
     :returns: shape (m, 5), as in `Building`.
     """
-    way = _sample_route(route)
+    route_points = _sample_route(route)
     pieces = []
     for room in rooms:
         for _ in range(draw.integers(1, 5)):
             piece = _draw_piece_at_wall(draw, room)
-            if clearance(furniture_walls(piece[None]), way).min() > _BERTH:
+            if clearance(furniture_walls(piece[None]), route_points).min() > _MIN_DISTANCE_TO_ROUTE:
                 pieces.append(piece)
     return np.array(pieces).reshape(-1, 5)
 
 
 def _sample_route(route: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points of the lines between way-points, 0.1 m apart at most, shape (n, 2)."""
+    """Points on the route, 0.1 m apart at most, shape (n, 2)."""
     parts = [
         start + np.linspace(0.0, 1.0, 2 + int(np.hypot(*(end - start)) / 0.1))[:, None] * (end - start)
         for start, end in pairwise(route)
@@ -76,26 +85,26 @@ def _draw_piece_at_wall(draw: np.random.Generator, room: Rectangle) -> NDArray[n
 
 
 def change_since_first_visit(building: Building, settings: Settings) -> Building:
-    """The building as it is at a later visit: pieces moved, doors that are not on the way closed, some of both."""
+    """The building at a later visit: with some pieces moved, and some doors off the route closed."""
     if not settings.visit:
         return building
-    way, walls = _sample_route(building.route), wall_index(building.walls)
+    route_points, walls = _sample_route(building.route), wall_index(building.walls)
     draw = random_stream(settings.run_seed, Purpose.CHANGES, 0)
     pieces = building.furniture.copy()
     for k in np.flatnonzero(draw.random(len(pieces)) < settings.changed):
-        moved = _draw_moved_piece(draw, walls, way, pieces[k], pieces[k])
+        moved = _draw_moved_piece(draw, walls, route_points, pieces[k], pieces[k])
         pieces[k] = pieces[k] if moved is None else moved
-    aside = np.array([clearance(door[None], way).min() > _BERTH for door in building.doors], dtype=np.bool_)
-    closed = building.doors[aside & (draw.random(len(aside)) < settings.changed)]
+    distances = np.array([clearance(door[None], route_points).min() for door in building.doors])
+    closed = building.doors[(distances > _MIN_DISTANCE_TO_ROUTE) & (draw.random(len(distances)) < settings.changed)]
     return replace(building, walls=np.concatenate((building.walls, closed)), furniture=pieces)
 
 
 def schedule_furniture(building: Building, walls: WallIndex, drive: Drive, settings: Settings) -> FurnitureSchedule:
-    """Move pieces at random between two visits of the robot: out of its sight, not far, and never into its way.
+    """Draw moves of pieces while the robot does not see them: near their old pose, and off its route.
 
     :param walls: of the building, without its furniture.
     """
-    times = np.arange(0.0, drive.duration, _LOOK)
+    times = np.arange(0.0, drive.duration, _SAMPLING_PERIOD)
     eyes = drive.poses(times)[:, :2]
     moves: list[tuple[float, int, NDArray[np.float64]]] = []
     for k, piece in enumerate(building.furniture if settings.moved > 0.0 else ()):
@@ -117,7 +126,7 @@ def schedule_furniture(building: Building, walls: WallIndex, drive: Drive, setti
 def _is_visible(
     walls: WallIndex, eyes: NDArray[np.float64], piece: NDArray[np.float64], reach: float
 ) -> NDArray[np.bool_]:
-    """Whether any corner of a piece is in reach and in sight from each of some points (n, 2), shape (n,)."""
+    """Whether any corner of a piece is within reach and visible from points (n, 2), shape (n,)."""
     seen = np.zeros(len(eyes), dtype=np.bool_)
     for corner in furniture_walls(piece[None])[:, :2]:
         near = np.hypot(*(eyes - corner).T) <= reach
@@ -126,25 +135,25 @@ def _is_visible(
 
 
 def _unseen_gaps(seen: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """The middle of every gap that is long enough between two stretches in which something is seen."""
-    looks = np.flatnonzero(seen)
-    gaps = np.flatnonzero(np.diff(looks) * _LOOK > _GAP)
-    return (looks[gaps] + looks[gaps + 1]) // 2
+    """The middle of every long enough gap between two samples in which a piece is seen."""
+    samples = np.flatnonzero(seen)
+    gaps = np.flatnonzero(np.diff(samples) * _SAMPLING_PERIOD > _MIN_UNSEEN_TIME)
+    return (samples[gaps] + samples[gaps + 1]) // 2
 
 
 def _draw_moved_piece(
     draw: np.random.Generator,
     walls: WallIndex,
-    way: NDArray[np.float64],
+    route_points: NDArray[np.float64],
     piece: NDArray[np.float64],
     home: NDArray[np.float64],
 ) -> NDArray[np.float64] | None:
-    """A place for a piece about its home, in the same room, off the way; None where none is found."""
+    """A new pose of a piece near its home, in the same room, off the route; None if none is found."""
     for _ in range(_TRIES):
-        pose = se2.compose(home[:3], _MOVE * draw.standard_normal(3))
+        pose = se2.compose(home[:3], _MOVE_DEVIATIONS * draw.standard_normal(3))
         moved = np.array([*pose, *home[3:]])
         sides = np.concatenate((furniture_walls(moved[None]), [[*piece[:2], *pose[:2]]]))
         free = has_line_of_sight(walls, sides[:, :2].copy(), sides[:, 2:].copy()).all()
-        if free and clearance(furniture_walls(moved[None]), way).min() > _BERTH:
+        if free and clearance(furniture_walls(moved[None]), route_points).min() > _MIN_DISTANCE_TO_ROUTE:
             return moved
     return None

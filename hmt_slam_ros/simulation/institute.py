@@ -1,7 +1,7 @@
-"""The floor of an institute, as large and of the same parts as the one in which Tomatis et al. (2003) experimented.
+"""The floor of an institute, like that of the experiments of Tomatis et al. (2003), section 4 and Fig. 7.
 
-Section 4 and Fig. 7: 50 m x 25 m of hallways with offices and meeting rooms beside them. Some doors are open; where
-these and the crossings are is where states are expected. Theirs has no large loop; here two passages make one.
+It has 50 m x 25 m of hallways with offices and meeting rooms beside them. Open doors and crossings are the states.
+Theirs has no large loop; here two passages make one.
 """
 
 from __future__ import annotations
@@ -19,20 +19,29 @@ from hmt_slam_ros.simulation.corridors import WALL, Plot, Room, cut_room, doors_
 from hmt_slam_ros.simulation.furniture import furnish
 from hmt_slam_ros.simulation.settings import Settings
 
-_HALF_X, _HALF_Y = 25.0, 12.5  # m
-_OPEN = 9  # rooms, which makes 13 states with the crossings
-_OFFICE, _MEETING = (3.0, 5.0), (6.0, 9.0)  # m, length along the hallway
-_OFFICE_DOOR, _MEETING_DOOR = (0.9, 1.1), (1.2, 1.8)  # m
-_APART = 2.5  # m, from an open door to the next along a hallway
-_FROM_CROSSING = 3.0  # m, likewise to the middle of a crossing
-_FROM_END = 2.0  # m, likewise to the end of a hallway
-_TURN = 1.0  # m, before the end of a hallway, where the robot turns
+_HALF_X, _HALF_Y = 25.0, 12.5
+"""Half the size of the floor, m."""
+
+_OPEN_ROOMS = 9
+"""Number of open rooms: 13 states with the crossings, as in the paper."""
+
+_OFFICE_LENGTHS, _MEETING_LENGTHS = (3.0, 5.0), (6.0, 9.0)
+"""Smallest and largest lengths of rooms along the hallway, m."""
+
+_OFFICE_DOORS, _MEETING_DOORS = (0.9, 1.1), (1.2, 1.8)
+"""Smallest and largest widths of their doors, m."""
+
+_MIN_DOOR_DISTANCE, _MIN_CROSSING_DISTANCE, _MIN_END_DISTANCE = 2.5, 3.0, 2.0
+"""Smallest distances of an open door from the next one, from a crossing, and from the end of the hallway, m."""
+
+_TURN_DISTANCE = 1.0
+"""Distance from the end of a hallway at which the robot turns, m."""
 
 
 class HallwayLayout(NamedTuple):
-    """Two hallways from end to end, along x, and two passages that join them, along y.
+    """Two hallways along x, and two passages that join them along y.
 
-    :ivar end: x of the hallways' ends, and of the other ones with the sign turned, m.
+    :ivar end: x of the hallways' ends, of both signs, m.
     :ivar ys: of the middles of the hallways, the southern first, m.
     :ivar xs: of the middles of the passages, the western first, m.
     :ivar hallways: widths of the hallways, m.
@@ -47,7 +56,7 @@ class HallwayLayout(NamedTuple):
 
 
 class Site(NamedTuple):
-    """Where a room may be: a plot on a side of a hallway.
+    """A possible room: a plot on a side of a hallway.
 
     :ivar hallway: number of the hallway, 0 for the southern.
     :ivar side: of the hallway.
@@ -62,14 +71,14 @@ class Site(NamedTuple):
 
     @property
     def door(self) -> float:
-        """Middle of the door along the hallway, x, m."""
+        """x of the middle of the door, m."""
         return self.side.origin[0] + self.plot.left + 0.5 * self.plot.door
 
 
 def institute(draw: np.random.Generator, settings: Settings) -> Building:
-    """Offices and meeting rooms beside two hallways, some open; later visits find other doors open, as many as before.
+    """Offices and meeting rooms beside two hallways, of which later visits find others open.
 
-    The robot drives all hallways and enters all open rooms.
+    The robot drives along all hallways and enters all open rooms.
     """
     floor, sites = _draw_layout(draw, settings.size)
     opened = _draw_open_doors(draw, floor, sites, settings)
@@ -82,7 +91,7 @@ def institute(draw: np.random.Generator, settings: Settings) -> Building:
         cut_room(plan, site.side, site.plot, floor.hallways[site.hallway], is_open=k in opened)
         for k, site in enumerate(sites)
     ]
-    # Whichever doors are open, furniture is in nobody's way.
+    # Furniture is off the route for any choice of open doors.
     pieces = furnish(draw, [room.floor for room in rooms], np.array(_route(floor, sites, rooms)))
     entered = [room for room in rooms if room.is_open]
     furniture = np.array([piece for piece in pieces if any(_contains(room, piece) for room in entered)])
@@ -92,7 +101,7 @@ def institute(draw: np.random.Generator, settings: Settings) -> Building:
 
 
 def _draw_layout(draw: np.random.Generator, size: float) -> tuple[HallwayLayout, list[Site]]:
-    """Hallways and all rooms, open or not."""
+    """Hallways and all possible rooms."""
     y0, y1 = -size * draw.uniform(4.6, 5.2), size * draw.uniform(4.6, 5.2)
     x0, x1 = -size * draw.uniform(12.0, 16.0), size * draw.uniform(12.0, 16.0)
     (w0, w1), (p0, p1) = draw.uniform(1.8, 2.4, 2).tolist(), draw.uniform(1.8, 2.4, 2).tolist()
@@ -114,18 +123,18 @@ def _draw_layout(draw: np.random.Generator, size: float) -> tuple[HallwayLayout,
 def _draw_sites(
     draw: np.random.Generator, hallway: int, side: Side, length: float, depth: float, meeting: int | None
 ) -> list[Site]:
-    """Rooms one beside the other along a side.
+    """Rooms along a side.
 
     :param length: of the side, m.
     :param depth: of the deepest room, m.
-    :param meeting: number of the one that is a meeting room, None for none.
+    :param meeting: number of the meeting room, None for none.
     """
     sites: list[Site] = []
     begin = WALL
     while True:
         is_meeting = len(sites) == meeting
-        end = begin + draw.uniform(*(_MEETING if is_meeting else _OFFICE))
-        door = draw.uniform(*(_MEETING_DOOR if is_meeting else _OFFICE_DOOR))
+        end = begin + draw.uniform(*(_MEETING_LENGTHS if is_meeting else _OFFICE_LENGTHS))
+        door = draw.uniform(*(_MEETING_DOORS if is_meeting else _OFFICE_DOORS))
         if end > length - WALL:
             return sites
         left, deep = draw.uniform(begin + 0.4, end - 0.4 - door), depth * draw.uniform(0.8, 1.0)
@@ -136,8 +145,8 @@ def _draw_sites(
 def _draw_open_doors(
     draw: np.random.Generator, floor: HallwayLayout, sites: Sequence[Site], settings: Settings
 ) -> set[int]:
-    """Which doors are open: the meeting rooms' first, and at a later visit some others in the stead of some."""
-    wanted = round(_OPEN * settings.size)
+    """Numbers of the open rooms: meeting rooms first, and at a later visit with some replaced by others."""
+    wanted = round(_OPEN_ROOMS * settings.size)
     order = sorted(draw.permutation(len(sites)).tolist(), key=lambda k: not sites[k].meeting)
     opened = _open_doors(floor, sites, [], order, wanted)
     if settings.visit:
@@ -152,20 +161,21 @@ def _draw_open_doors(
 def _open_doors(
     floor: HallwayLayout, sites: Sequence[Site], opened: Sequence[int], order: Sequence[int], wanted: int
 ) -> list[int]:
-    """Open more doors in an order, none near to another, a crossing or the end of its hallway, up to as many."""
+    """Open more doors in an order, far enough from others, crossings and ends, up to the wanted number."""
     filled = list(opened)
     for k in order:
         door = sites[k].door
         beside = [sites[other].door for other in filled if sites[other].hallway == sites[k].hallway]
-        free = all(abs(door - x) >= _APART for x in beside) and all(abs(door - x) >= _FROM_CROSSING for x in floor.xs)
-        if free and abs(door) <= floor.end - _FROM_END and len(filled) < wanted:
+        free = all(abs(door - x) >= _MIN_DOOR_DISTANCE for x in beside)
+        free &= all(abs(door - x) >= _MIN_CROSSING_DISTANCE for x in floor.xs)
+        if free and abs(door) <= floor.end - _MIN_END_DISTANCE and len(filled) < wanted:
             filled.append(k)
     return filled
 
 
 def _route(floor: HallwayLayout, sites: Sequence[Site], rooms: Sequence[Room]) -> list[Point]:
-    """East along the southern hallway, over to the northern one, west along it and back, into rooms on the way."""
-    end = floor.end - _TURN
+    """The route east along the southern hallway, west along the northern one and back, with visits of rooms."""
+    end = floor.end - _TURN_DISTANCE
     (x0, x1), (y0, y1) = floor.xs, floor.ys
     visits: tuple[list[Point], list[Point]] = ([], [])
     for site, room in sorted(zip(sites, rooms, strict=True), key=lambda pair: pair[0].door):
@@ -186,7 +196,7 @@ def _route(floor: HallwayLayout, sites: Sequence[Site], rooms: Sequence[Room]) -
 
 
 def _states(floor: HallwayLayout, sites: Sequence[Site], rooms: Sequence[Room]) -> TopologicalStates:
-    """The four crossings, then the doors of open rooms."""
+    """The states of the four crossings, then of open rooms."""
     up = 0.5 * math.pi
     rows = [
         (x, y, heading, 0.5 * hallway, passage, True)

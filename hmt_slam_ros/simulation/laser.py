@@ -1,7 +1,6 @@
-"""The laser of the simulated robot: ray casting, and noise.
+"""The simulated laser: ray casting in a grid of walls, and noise.
 
-The walls lie in a uniform grid; a beam walks from cell to cell and stops at the first cell whose walls it meets. It has
-a direction and no end, so its steps are lengths, and it may begin outside of the grid.
+A beam walks from cell to cell, and stops at the first cell whose walls it meets. It may begin outside the grid.
 """
 
 from __future__ import annotations
@@ -20,21 +19,27 @@ from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.settings import Settings
 
-# A beam does not slip through between two walls that share a corner, whatever the last bits of the corner are.
 _SLACK = 1e-9
-# A wall is looked up in all cells that it comes this near to, in cells.
+"""Share by which walls are longer at both ends, so that no beam passes between two walls of one corner."""
+
 _SKIN = 1e-6
-_CELL = 1.0  # m
+"""Distance from a cell up to which a wall belongs to it, in cells."""
+
+_CELL = 1.0
+"""Side of a cell, m."""
+
+_RANGE_MIN = 0.02
+"""Smallest range of the laser, m."""
 
 
 class WallIndex(NamedTuple):
-    """Walls by the cells of a grid that they pass through.
+    """Walls, sorted by the cells of a grid.
 
     :ivar walls: shape (n, 4), x and y of both ends, m.
     :ivar corner: shape (2,), lower left corner of the grid, m.
     :ivar shape: shape (2,), columns and rows.
     :ivar cell: side of a cell, m.
-    :ivar starts: shape (columns * rows + 1,), where the walls of each cell begin in ``members``.
+    :ivar starts: shape (columns * rows + 1,), begin of each cell in ``members``.
     :ivar members: numbers of the walls, cell by cell.
     """
 
@@ -62,7 +67,7 @@ def wall_index(walls: NDArray[np.float64], cell: float = _CELL) -> WallIndex:
 
 @njit(cache=True)
 def _fill_cells(walls: Float64, corner: Float64, shape: Int64, cell: float, at: Int32, members: Int32) -> None:
-    """Count the walls of every cell, in the place behind it; or, given where each cell begins, fill the cells in."""
+    """Count the walls of each cell at its number + 1 in ``at``; or, with ``members``, fill them in from ``at`` on."""
     for k in range(walls.shape[0]):
         ax, ay = (walls[k, 0] - corner[0]) / cell, (walls[k, 1] - corner[1]) / cell
         bx, by = (walls[k, 2] - corner[0]) / cell, (walls[k, 3] - corner[1]) / cell
@@ -70,7 +75,7 @@ def _fill_cells(walls: Float64, corner: Float64, shape: Int64, cell: float, at: 
         length = math.hypot(dx, dy)
         for row in range(int(min(ay, by) - _SKIN), int(max(ay, by) + _SKIN) + 1):
             for column in range(int(min(ax, bx) - _SKIN), int(max(ax, bx) + _SKIN) + 1):
-                # Distance of the cell's middle from the wall's line, against that of its farthest corner.
+                # Distance of the cell's middle from the wall's line, compared with that of its farthest corner.
                 away = abs(dx * (row + 0.5 - ay) - dy * (column + 0.5 - ax))
                 if away <= 0.5 * (abs(dx) + abs(dy)) + _SKIN * (1.0 + length):
                     number = row * shape[0] + column
@@ -88,7 +93,7 @@ def cast_rays(index: WallIndex, origins: Float64, angles: Float64, reach: float)
     :param origins: shape (n, 2), m.
     :param angles: shape (n,), rad.
     :param reach: m.
-    :returns: shape (n,), m; inf where there is no wall within reach.
+    :returns: shape (n,), m; inf without a wall within reach.
     """
     distances = np.empty(angles.shape[0])
     for n in range(angles.shape[0]):
@@ -138,7 +143,7 @@ def _cast_ray(index: WallIndex, x: float, y: float, cos: float, sin: float, reac
 
 @njit(cache=True)
 def _axis_steps(start: float, direction: float, cell: int) -> tuple[int, float, float]:
-    """Along one axis: the cell step, the length of a beam per cell, and its length up to the border of a cell."""
+    """Along one axis: the cell step, the length of a beam per cell, and its length to the border of a cell."""
     step = 1 if direction > 0.0 else -1
     if direction == 0.0:
         return step, math.inf, math.inf
@@ -147,7 +152,7 @@ def _axis_steps(start: float, direction: float, cell: int) -> tuple[int, float, 
 
 @njit(cache=True)
 def _clip_to_grid(start: float, direction: float, size: int) -> tuple[float, float]:
-    """Where a beam enters the stretch from 0 to ``size``, not before its start, and where it leaves it."""
+    """Lengths at which a beam enters the interval from 0 to ``size``, 0 at least, and leaves it."""
     if direction == 0.0:
         return (0.0, math.inf) if 0.0 <= start <= size else (math.inf, 0.0)
     a, b = -start / direction, (size - start) / direction
@@ -156,7 +161,7 @@ def _clip_to_grid(start: float, direction: float, size: int) -> tuple[float, flo
 
 @njit(cache=True)
 def _distance_to_wall(walls: Float64, k: int, x: float, y: float, cos: float, sin: float) -> float:
-    """Distance along a beam to a wall, inf where it passes; a wall along the beam is not seen."""
+    """Distance along a beam to a wall, inf for a miss or a parallel wall."""
     ox, oy = walls[k, 0] - x, walls[k, 1] - y
     dx, dy = walls[k, 2] - walls[k, 0], walls[k, 3] - walls[k, 1]
     cross = cos * dy - sin * dx
@@ -169,7 +174,7 @@ def _distance_to_wall(walls: Float64, k: int, x: float, y: float, cos: float, si
 
 @njit(cache=True)
 def shorten_at_discs(discs: Float64, origins: Float64, angles: Float64, distances: Float64) -> None:
-    """Shorten distances (n,), m, to those discs that stand before them; a beam from within a disc does not see it.
+    """Shorten distances (n,), m, by discs; a beam from within a disc passes it.
 
     :param discs: shape (k, 3), x, y and radius, m.
     :param origins: shape (n, 2), m.
@@ -198,17 +203,14 @@ def clearance(walls: Float64, points: Float64) -> Float64:
     return np.sqrt(nearest)
 
 
-_RANGE_MIN = 0.02  # m
-
-
 class Laser:
-    """A planar range finder that looks ahead.
+    """A planar range finder that faces ahead.
 
     :ivar pose: shape (3,), ``base_T_laser``, m and rad.
     :ivar angles: shape (n,), of the beams, rad.
-    :ivar half_field: largest angle to either side at which it sees, rad.
+    :ivar half_field: half the field of view, rad.
     :ivar reach: m.
-    :ivar times: shape (n,), of each beam after the first, s; shape (1,) where there is no time between them.
+    :ivar times: shape (n,), of each beam after the first, s; shape (1,) without time between them.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -218,7 +220,7 @@ class Laser:
         self.reach = settings.range
         field = math.radians(settings.field_of_view)
         self.half_field = 0.5 * field
-        # Beams all around: the last is not the first once more.
+        # In a full circle the last beam differs from the first.
         gaps = settings.beams - 1 if settings.field_of_view < 360.0 else settings.beams
         self._first, self._gap = -self.half_field, field / gaps
         self.angles = self._first + self._gap * np.arange(settings.beams)
@@ -226,7 +228,7 @@ class Laser:
     def distances(
         self, poses: NDArray[np.float64], walls: WallIndex, discs: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """True distance along each beam, shape (n,), m; inf where there is nothing within reach.
+        """True distance along each beam, shape (n,), m; inf for nothing within reach.
 
         :param poses: shape (n, 3), ``world_T_base`` at each beam, or (1, 3) for all.
         :param discs: shape (k, 3), x, y and radius of people, m.
@@ -239,7 +241,7 @@ class Laser:
         return distances
 
     def scan(self, number: int, stamp: int, distances: NDArray[np.float64]) -> Scan:
-        """What the laser makes of true distances (n,), m: noise, and beams that do not return, which read inf.
+        """The scan of true distances (n,), m, with noise; lost beams read inf.
 
         :param number: of the scan, which determines its noise.
         """

@@ -1,4 +1,4 @@
-"""All of a simulated drive: the building, the robot's way, what its wheels say and what its laser sees."""
+"""Scenario of a simulated drive: building, path, odometry and scans."""
 
 from __future__ import annotations
 
@@ -13,23 +13,29 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.building import Building, furniture_walls
-from hmt_slam_ros.simulation.drive import Drive, drive_along, path_through
+from hmt_slam_ros.simulation.drive import (
+    Drive,
+    draw_slips,
+    drive_along,
+    noisy_increments,
+    odometry_readings,
+    path_through,
+)
 from hmt_slam_ros.simulation.furniture import change_since_first_visit, schedule_furniture
 from hmt_slam_ros.simulation.laser import Laser, WallIndex, clearance, wall_index
 from hmt_slam_ros.simulation.people import draw_people
 from hmt_slam_ros.simulation.settings import Settings
-from hmt_slam_ros.simulation.wheels import draw_slips, noisy_increments, odometry_readings
 
 
 @dataclass(frozen=True)
 class KidnappedDrive:
-    """A drive of which a part is left out or driven once more; where it goes on, the robot first turns to its way.
+    """A drive with a kidnapping: a jump from one time of a drive to another, after which the robot turns to its path.
 
-    :ivar drive: without that.
-    :ivar kidnap_time: s, when the robot is carried, in no time.
-    :ivar resume_time: s, the time at which the drive passes where it is put.
-    :ivar heading_offset: rad, by how much more than there it is turned to the left when it is put down.
-    :ivar turn_duration: s, that it takes to turn back.
+    :ivar drive: without the kidnapping.
+    :ivar kidnap_time: of the jump, s.
+    :ivar resume_time: time of the drive at which it goes on, s.
+    :ivar heading_offset: rotation of the robot to the left by the kidnapping, rad.
+    :ivar turn_duration: of the turn back, s.
     """
 
     drive: Drive
@@ -54,7 +60,7 @@ class KidnappedDrive:
         return poses
 
     def wheel_poses(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The same as exact wheels have it, (k, 3): nothing happened when it was carried."""
+        """Poses (k, 3) by exact wheels, which do not measure the kidnapping."""
         poses = self.poses(seconds)
         before = self.drive.poses(np.array([self.kidnap_time]))[0]
         jump = se2.compose(before, se2.inverse(self.poses(np.array([self.kidnap_time]))[0]))
@@ -64,7 +70,7 @@ class KidnappedDrive:
 
 
 def kidnapped_drive(drive: Drive, settings: Settings) -> KidnappedDrive | None:
-    """The drive with what settings say of a robot that is carried, None where it never is."""
+    """The drive with the kidnapping of the settings; None for none."""
     if settings.carried == 0.0:
         return None
     turned = math.radians(settings.turned)
@@ -76,25 +82,30 @@ START = 1_000_000_000_000
 """Stamp of the first scan, ns."""
 
 _SECOND = 1e9
-_CLOSED = 1e-6  # m
-_STEP = 0.1  # s, between two points of the way that have to be clear
+"""ns in a second."""
+
+_CLOSED = 1e-6
+"""Largest distance between both ends of a closed route, m."""
+
+_STEP = 0.1
+"""Time between two points of the path whose clearance is checked, s."""
 
 
 class Scenario:
     """A robot's drive through a building.
 
-    :ivar settings: what was chosen.
-    :ivar building: walls, route and furniture at the start of this visit.
-    :ivar drive: the robot's way, and when it is where if it is not carried.
-    :ivar laser: the robot's.
-    :ivar people: who else is about.
-    :ivar walls: of the building and its closed doors, without furniture.
+    :ivar settings: of the drive.
+    :ivar building: at the start of this visit.
+    :ivar drive: of the robot, without a kidnapping.
+    :ivar laser: of the robot.
+    :ivar people: in the building.
+    :ivar walls: of the building with its closed doors, without furniture.
     :ivar stamps: shape (n,), of the odometry readings, ns; every ``settings.readings``-th is a scan's as well.
     :ivar poses: shape (n, 3), ``world_T_base`` at these stamps, m and rad.
-    :ivar odometry: shape (n, 3), ``odom_T_base`` as the wheels have it.
-    :ivar slips: shape (k - 1, 3), what slips added to the motion from each of the k scans to the next, m, m, rad.
+    :ivar odometry: shape (n, 3), ``odom_T_base`` by the wheels, m and rad.
+    :ivar slips: shape (k - 1, 3), errors by slips between the k scans, m, m, rad.
 
-    :raises HmtSlamError: where the route comes closer to a wall or to furniture than the robot's radius.
+    :raises HmtSlamError: for a route closer to a wall or furniture than the robot's radius.
     """
 
     def __init__(self, building: Building, settings: Settings) -> None:
@@ -119,11 +130,9 @@ class Scenario:
         period = 1.0 / (settings.rate * settings.readings)
         self.stamps: NDArray[np.int64] = START + np.round(_SECOND * period * ticks).astype(np.int64)
         self.poses = self.true_poses(self.stamps)
-        self._wheel_poses = (
-            self.poses
-            if self._kidnapped_drive is None
-            else self._kidnapped_drive.wheel_poses(self._seconds(self.stamps))
-        )
+        self._wheel_poses = self.poses
+        if self._kidnapped_drive is not None:
+            self._wheel_poses = self._kidnapped_drive.wheel_poses(self._seconds(self.stamps))
         self.slips = self._draw_slips()
         self.odometry = self._odometry()
 
@@ -134,7 +143,7 @@ class Scenario:
 
     @property
     def surfaces(self) -> WallIndex:
-        """Walls, closed doors and furniture as they are at first."""
+        """Walls, closed doors and furniture at the start."""
         return self._wall_indices[0]
 
     def true_poses(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -146,18 +155,17 @@ class Scenario:
         return self.laser.scan(number, int(self.scan_stamps[number]), self.distances(number))
 
     def distances(self, number: int) -> NDArray[np.float64]:
-        """What the beams of a scan truly meet, shape (n,), m from the laser; inf where that is nothing."""
+        """True distances along the beams of a scan, shape (n,), m; inf for nothing within reach."""
         seconds = float(self._seconds(self.scan_stamps[number : number + 1])[0])
         poses = self._executed_drive.poses(seconds + self.laser.times)
         epoch = int(np.searchsorted(self._furniture_schedule.times, seconds, side="right")) - 1
         return self.laser.distances(poses, self._wall_indices[epoch], self.people.discs_at(seconds, poses[0]))
 
     def furniture(self, stamp: int) -> NDArray[np.float64]:
-        """Where the furniture stands at a stamp, ns, (m, 5) as in `Building`."""
+        """The furniture at a stamp, ns, (m, 5) as in `Building`."""
         seconds = self._seconds(np.array([stamp]))[0]
-        return self._furniture_schedule.pieces[
-            int(np.searchsorted(self._furniture_schedule.times, seconds, side="right")) - 1
-        ]
+        epoch = int(np.searchsorted(self._furniture_schedule.times, seconds, side="right")) - 1
+        return self._furniture_schedule.pieces[epoch]
 
     def _seconds(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
         return (stamps - START) / _SECOND
@@ -191,7 +199,7 @@ class Scenario:
 
 
 def driven_route(route: NDArray[np.float64], laps: int) -> NDArray[np.float64]:
-    """All way-points of some laps, shape (n, 2), m; a route that is not closed is driven there and back in turn."""
+    """The way-points of some laps, shape (n, 2), m; an open route is driven there and back in turn."""
     closed = bool(np.hypot(*(route[-1] - route[0])) < _CLOSED)
     ways = [route if closed or lap % 2 == 0 else route[::-1] for lap in range(laps)]
     return np.concatenate([ways[0], *(way[1:] for way in ways[1:])])

@@ -1,8 +1,9 @@
-"""A world of one's own: a YAML file with walls, an occupancy image as nav2's map_server reads it, and a route."""
+"""Simulated worlds: families of buildings by name, and world files."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,23 +11,73 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from hmt_slam_ros.configuration.flat import Value
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.simulation import corridors
 from hmt_slam_ros.simulation.building import Building, outline_of_cells
+from hmt_slam_ros.simulation.institute import institute
+from hmt_slam_ros.simulation.settings import Settings
+
+
+@dataclass(frozen=True)
+class Family:
+    """A kind of building.
+
+    :ivar build: draws a building of the kind.
+    :ivar description: one sentence.
+    :ivar default_settings: settings of the family that differ from the common defaults.
+    """
+
+    build: Callable[[np.random.Generator, Settings], Building]
+    description: str
+    default_settings: Mapping[str, Value] = field(default_factory=dict)
+
+
+FAMILIES: dict[str, Family] = {
+    "office": Family(corridors.office, "Offices with furniture on both sides of a ring of corridors."),
+    "busy": Family(
+        corridors.office,
+        "The same with people in the corridors, and furniture that is moved between visits.",
+        {"people": 6, "moved": 0.5},
+    ),
+    "nested": Family(
+        corridors.nested,
+        "Loops inside loops, 0.5 km of corridors with niches; size=4 makes 2 km of them.",
+        {"laps": 1},
+    ),
+    "grid": Family(corridors.grid, "Corridors that cross at equal distances and look all alike.", {"laps": 1}),
+    "ring": Family(corridors.symmetric_ring, "A square ring of corridors whose four sides are alike."),
+    "straight": Family(corridors.straight, "A ring with two long halls without any feature.", {"range": 10.0}),
+    "hall": Family(
+        corridors.hall, "An open hall in whose middle the laser reaches nothing.", {"range": 8.0, "laps": 1}
+    ),
+    "twins": Family(
+        corridors.twins,
+        "Two identical rooms; lost in a hall in between, the robot enters one of them again.",
+        {"range": 4.0, "laps": 1},
+    ),
+    "institute": Family(
+        institute,
+        "Hallways of 50 m x 25 m with crossings, offices and meeting rooms, of which 9 are open, and people; a visit "
+        "finds others open.",
+        {"laps": 1, "people": 4, "field_of_view": 360.0, "beams": 720},
+    ),
+}
 
 _KEYS = ("walls", "furniture", "route", "settings", "image", "resolution", "origin", "negate", "occupied_thresh")
-# map_server's, that this needs not.
 _IGNORED = ("free_thresh", "mode")
+"""Keys of map_server that have no effect here."""
 
 
 def read_world(path: Path) -> tuple[Building, dict[str, Any]]:
-    """The building of a world file, and its settings.
+    """The building and the settings of a world file.
 
-    ``walls`` are lists of x0, y0, x1, y1 (m), ``route`` of x, y (m), ``furniture`` of x, y, heading (degrees), length,
-    width (m). ``image`` (relative to the file), ``resolution``, ``origin``, ``negate`` and ``occupied_thresh`` are
-    those of map_server's map.yaml: the edges of occupied pixels are walls.
+    It has ``walls`` as lists of x0, y0, x1, y1 (m), ``route`` of x, y (m), and ``furniture`` of x, y, heading
+    (degrees), length, width (m). ``image`` (relative to the file), ``resolution``, ``origin``, ``negate`` and
+    ``occupied_thresh`` are those of map_server's map.yaml: the edges of occupied pixels are walls.
 
-    :raises HmtSlamError: where file or image cannot be read, a key is unknown, or a table is none.
+    :raises HmtSlamError: if file or image cannot be read, a key is unknown, or a table is malformed.
     """
     content = _content(path)
     unknown = sorted(set(content) - {*_KEYS, *_IGNORED})
@@ -46,9 +97,9 @@ def read_world(path: Path) -> tuple[Building, dict[str, Any]]:
 
 
 def walls_of_image(occupied: NDArray[np.bool_], resolution: float, origin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The edges of the occupied pixels as walls (n, 4), m.
+    """Walls (n, 4) at the edges of occupied pixels, m.
 
-    :param occupied: shape (height, width); row 0 is the top, largest y.
+    :param occupied: shape (height, width); row 0 has the largest y.
     :param resolution: side of a pixel, m.
     :param origin: shape (3,), pose of the lower left corner of the image, m and rad.
     """
@@ -69,7 +120,7 @@ def _content(path: Path) -> Mapping[str, Any]:
 
 
 def _table(path: Path, content: Mapping[str, Any], key: str, columns: int) -> NDArray[np.float64]:
-    """Rows of numbers, shape (n, columns); none where there is no such key."""
+    """The rows of a key, shape (n, columns); none without the key."""
     try:
         rows = np.array(content.get(key) or [], dtype=np.float64).reshape(-1, columns)
         lengths = {len(row) for row in content.get(key) or []}
@@ -94,6 +145,6 @@ def _walls_of_image(path: Path, content: Mapping[str, Any]) -> NDArray[np.float6
     except (OSError, ValueError, SyntaxError) as fault:
         raise HmtSlamError(f"the image {file} cannot be read ({fault}): give a PGM or PNG file.") from fault
     brightness = pixels / 255.0 if pixels.dtype == np.uint8 else pixels.astype(np.float64)
-    grey = brightness if brightness.ndim == 2 else brightness[..., : min(3, brightness.shape[2])].mean(axis=2)
-    occupancy = grey if content.get("negate") else 1.0 - grey
+    gray = brightness if brightness.ndim == 2 else brightness[..., : min(3, brightness.shape[2])].mean(axis=2)
+    occupancy = gray if content.get("negate") else 1.0 - gray
     return walls_of_image(occupancy > threshold, resolution, origin)
