@@ -28,7 +28,6 @@ from hmt_slam_ros.results.log_reading import describe_log, describe_parameter_ch
 from hmt_slam_ros.results.output_folder import atomic_output, check_replaceable, map_writer, write_output
 from hmt_slam_ros.results.report import RunMetrics, code_bytes
 from hmt_slam_ros.saved_map.folder import HMT_MAP
-from hmt_slam_ros.view.server import LOCAL, check_port
 
 
 def run_map(options: argparse.Namespace) -> None:
@@ -123,6 +122,8 @@ def run_replay(options: argparse.Namespace) -> None:
     except ImportError as fault:
         raise HmtSlamError(f"replay needs ROS ({fault}): source Jazzy or install its wheels, or use map") from fault
     if options.view is not None:
+        from hmt_slam_ros.view.server import LOCAL, check_port  # noqa: PLC0415  Pillow is for the page alone
+
         check_port(options.view)
         print(f"the live page is at http://{LOCAL}:{options.view}/", file=sys.stderr)
     with Progress(log.scan_count, log.duration) as progress:
