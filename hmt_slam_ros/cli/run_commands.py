@@ -25,8 +25,14 @@ from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.final_map import FinalMap, deskewed_scans, final_map
 from hmt_slam_ros.results.hmt_map import RunState, read_run_state, read_saved_map
 from hmt_slam_ros.results.log_reading import describe_log, describe_parameter_changes, is_newest_log, map_folder
-from hmt_slam_ros.results.output_folder import atomic_output, check_replaceable, map_writer, write_output
-from hmt_slam_ros.results.report import RunMetrics, code_bytes
+from hmt_slam_ros.results.output_folder import (
+    RunMetrics,
+    atomic_output,
+    check_replaceable,
+    code_bytes,
+    map_writer,
+    write_output,
+)
 from hmt_slam_ros.saved_map.folder import HMT_MAP
 
 
