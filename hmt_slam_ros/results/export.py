@@ -137,9 +137,9 @@ def export_topology(directory: Path) -> tuple[Path, Path, Path]:
     A node of the graph is an area with ``map_T_area``, the number of its ``keyframes``, whether the ``robot`` was in it
     at the end, and the probability that it is a ``hallway``, where enough is known around it. An edge from a to b is an
     arc with ``a_T_b`` and whether it is a loop ``closure``. Poses are x, y in m and theta in rad; xx to tt are the
-    upper triangle of the covariance in the right tangent frame. ``portals`` is the number of openings that the path passed
-    between the two areas. The most probable one is given as portal_x to portal_tt, ``a_T_portal`` with the heading from
-    a to b, ``portal_width``, m, and ``portal_existence``, its probability.
+    upper triangle of the covariance in the right tangent frame. ``portals`` is the number of openings that the path
+    passed between the two areas. The most probable one is given as portal_x to portal_tt, ``a_T_portal`` with the
+    heading from a to b, ``portal_width``, m, and ``portal_existence``, its probability.
 
     :param directory: output folder of a run.
     :returns: the three files.
