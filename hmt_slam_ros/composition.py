@@ -1,4 +1,4 @@
-"""Composition: makes the five processes of a configuration, with the plug-ins of Tomatis et al.
+"""Composition: makes processes with the plug-ins of Tomatis et al. that a configuration asks for.
 
 Lines, landmarks and places implement three protocols: `submap.local_filter.FilterFactory`,
 `area_abstraction.doors.OpeningDetector` and `topological_inference.landmark_evidence.LandmarkEvidence`. They are
@@ -16,10 +16,8 @@ if TYPE_CHECKING:
     from hmt_slam_ros.area_abstraction.aam import Aam
     from hmt_slam_ros.area_abstraction.doors import OpeningDetector
     from hmt_slam_ros.area_abstraction.partition import AamState
-    from hmt_slam_ros.loop_closure.tlca import Tlca, TlcaState
     from hmt_slam_ros.messages.replica import Replica
     from hmt_slam_ros.metric_slam.slam import MetricSlam, SlamState
-    from hmt_slam_ros.real_time_localization.rtl import Rtl, RtlState
     from hmt_slam_ros.sensors import Scan
     from hmt_slam_ros.submap.local_filter import FilterFactory
     from hmt_slam_ros.submap.local_mapping import LocalMapping
@@ -75,26 +73,6 @@ def topological_inference(configuration: Configuration, state: TsbiState | None 
     from hmt_slam_ros.topological_inference.tsbi import Tsbi  # noqa: PLC0415
 
     return Tsbi(configuration, branching, state)
-
-
-def loop_closure(configuration: Configuration, state: TlcaState | None = None) -> Tlca:
-    """TLCA.
-
-    :param state: state from which it continues, None for the start.
-    """
-    from hmt_slam_ros.loop_closure.tlca import Tlca  # noqa: PLC0415
-
-    return Tlca(configuration, state)
-
-
-def real_time_localization(configuration: Configuration, state: RtlState | None = None) -> Rtl:
-    """Real-time localization.
-
-    :param state: state from which it continues, None for the start.
-    """
-    from hmt_slam_ros.real_time_localization.rtl import Rtl  # noqa: PLC0415
-
-    return Rtl(configuration, state)
 
 
 def branching(configuration: Configuration, replica: Replica) -> Branching:

@@ -44,7 +44,7 @@ class ProcessRow(NodeRow):
 
     Its messages include at least one of the chain Keyframe, AreaEvents, Hypotheses, ClosureDecision.
 
-    :ivar factory: "module:function" that makes the process from a configuration and a state or None.
+    :ivar factory: "module:function" or "module:Class" that makes the process from a configuration and a state or None.
     :ivar state: "module:Class" of its state; without arguments the class is the state before the first message.
     :ivar produces: names of the message classes that it sends; ``Notice`` is implied.
     """
@@ -120,7 +120,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
         title="loop closure acceptance and the global map",
         node_module=f"{_ROS}.tlca_node",
         consumes=("Keyframe", "Hypotheses"),
-        factory=f"{_COMPOSITION}:loop_closure",
+        factory="hmt_slam_ros.loop_closure.tlca:Tlca",
         state="hmt_slam_ros.loop_closure.tlca:TlcaState",
         produces=("ClosureDecision",),
     ),
@@ -129,7 +129,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
         title="real-time localization",
         node_module=f"{_ROS}.rtl_node",
         consumes=("Odometry", "TrackingReset", "LocalEstimate", "Hypotheses", "ClosureDecision"),
-        factory=f"{_COMPOSITION}:real_time_localization",
+        factory="hmt_slam_ros.real_time_localization.rtl:Rtl",
         state="hmt_slam_ros.real_time_localization.rtl:RtlState",
         produces=("RealTimePose",),
     ),

@@ -24,7 +24,7 @@ from hmt_slam_ros.logs.bag import (
     read_messages,
     read_topics,
 )
-from hmt_slam_ros.logs.mounting import frame_name, transform_from_quaternion
+from hmt_slam_ros.logs.mounting import frame_name, transform_from_message
 from hmt_slam_ros.logs.ros_types import ODOMETRY, TRANSFORMS, RosMessage, deserialize
 
 _MAX_TILT = math.radians(2.0)
@@ -108,10 +108,7 @@ class TransformCollector:
         """Add a tf2_msgs/TFMessage."""
         for stamped in message.transforms:
             key = (frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id), topic)
-            translation, rotation = stamped.transform.translation, stamped.transform.rotation
-            transform = transform_from_quaternion(
-                (translation.x, translation.y, translation.z), (rotation.x, rotation.y, rotation.z, rotation.w)
-            )
+            transform = transform_from_message(stamped.transform)
             first = self._first_transforms.setdefault(key, transform)
             self._message_counts[key] += 1
             self._max_changes[key] = max(self._max_changes.get(key, 0.0), float(np.abs(transform - first).max()))

@@ -151,7 +151,7 @@ class _Measurement(NamedTuple):
 
 
 class BagLog:
-    """A rosbag2 whose scans are read from disk when they are needed.
+    """A rosbag2 whose scans are read from disk when they are needed; the attributes are those of `Log`.
 
     Opening reads the whole bag once, which reveals damage. The source stamp of a record is that of its header. Records
     have the order of their bag times; of equal bag times, odometry comes before the scan.
@@ -165,6 +165,7 @@ class BagLog:
 
     def __init__(self, path: Path, window: TimeWindow, scan_topic: str, odom_topic: str) -> None:
         self._path = path
+        self.name = path.stem if path.is_file() else path.name
         topics = read_topics(path)
         self._scan_topic = choose_scan_topic(topics, scan_topic, path.name)
         self._odom_topic = choose_odom_topic(topics, odom_topic, path.name)
@@ -173,26 +174,12 @@ class BagLog:
         is_scan = [frame is not None for _, _, frame in headers]
         self._stamps = running_stamps([stamp for _, stamp, _ in headers], is_scan, _precedes_its_scan(headers))
         self._records_in_window = window.select(self._stamps)
-        self._scan_count = sum(is_scan[self._records_in_window])
-        require_scans(path.name, self._scan_count, sum(is_scan))
+        self.scan_count = sum(is_scan[self._records_in_window])
+        require_scans(path.name, self.scan_count, sum(is_scan))
+        part = self._stamps[self._records_in_window]
+        self.duration = float(part[-1] - part[0]) / NANOSECONDS
         self._true_poses = self._read_true_poses(topics)
         self._mountings = self._find_mountings(sorted({frame for _, _, frame in headers if frame is not None}))
-
-    @property
-    def name(self) -> str:
-        """Short name for reports."""
-        return self._path.stem if self._path.is_file() else self._path.name
-
-    @property
-    def scan_count(self) -> int:
-        """Number of scans."""
-        return self._scan_count
-
-    @property
-    def duration(self) -> float:
-        """Seconds from the first to the last record."""
-        part = self._stamps[self._records_in_window]
-        return float(part[-1] - part[0]) / NANOSECONDS
 
     def records(self) -> Iterator[LogRecord]:
         """All measurements in file order."""

@@ -64,6 +64,12 @@ def transform_from_quaternion(translation: ArrayLike, quaternion: ArrayLike) -> 
     return transform
 
 
+def transform_from_message(transform: RosMessage) -> NDArray[np.float64]:
+    """The homogeneous transform, shape (4, 4), m, of a geometry_msgs/Transform."""
+    shift, turn = transform.translation, transform.rotation
+    return transform_from_quaternion((shift.x, shift.y, shift.z), (turn.x, turn.y, turn.z, turn.w))
+
+
 def heading_from_quaternion(quaternion: ArrayLike) -> float:
     """The rotation about z, rad; exact where the rotation is about z alone.
 
@@ -93,9 +99,8 @@ class FrameTree:
         for stamped in message.transforms:
             child = frame_name(stamped.child_frame_id)
             if self._newest or child not in self._parents:
-                shift, turn = stamped.transform.translation, stamped.transform.rotation
-                transform = transform_from_quaternion((shift.x, shift.y, shift.z), (turn.x, turn.y, turn.z, turn.w))
-                self._parents[child] = (frame_name(stamped.header.frame_id), transform)
+                parent = frame_name(stamped.header.frame_id)
+                self._parents[child] = (parent, transform_from_message(stamped.transform))
 
     def lookup_transform(self, base: str, frame: str) -> NDArray[np.float64] | None:
         """``base_T_frame``, shape (4, 4), m; None where no chain of transforms connects the two."""

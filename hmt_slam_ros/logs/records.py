@@ -118,7 +118,7 @@ def require_scans(name: str, in_window: int, in_log: int) -> None:
 
 
 class InMemoryLog:
-    """A log with all measurements in memory.
+    """A log with all measurements in memory; the attributes are those of `Log`.
 
     :raises HmtSlamError: where there is no scan.
     """
@@ -129,26 +129,12 @@ class InMemoryLog:
             [entry.source_stamp for entry in entries], is_scan, [entry.precedes_its_scan for entry in entries]
         )
         part = window.select(stamps)
-        self._name = name
+        self.name = name
+        self.scan_count = sum(is_scan[part])
+        require_scans(name, self.scan_count, sum(is_scan))
         self._entries = entries[part]
         self._stamps = stamps[part]
-        self._scan_count = sum(is_scan[part])
-        require_scans(name, self._scan_count, sum(is_scan))
-
-    @property
-    def name(self) -> str:
-        """Short name for reports."""
-        return self._name
-
-    @property
-    def scan_count(self) -> int:
-        """Number of scans."""
-        return self._scan_count
-
-    @property
-    def duration(self) -> float:
-        """Seconds from the first to the last record."""
-        return float(self._stamps[-1] - self._stamps[0]) / NANOSECONDS
+        self.duration = float(self._stamps[-1] - self._stamps[0]) / NANOSECONDS
 
     def records(self) -> Iterator[LogRecord]:
         """All measurements in file order."""

@@ -63,32 +63,19 @@ class LogReader:
 
     def __init__(self, state: LogProgress) -> None:
         """:param state: progress from which reading continues."""
-        self._records_read, self._first_scans, self._earlier_trajectory = (
-            state.records_read,
-            state.first_scans,
-            state.earlier_trajectory,
-        )
-        self._clock_offset, self._checksum = state.clock_offset, state.checksum
+        self._progress, self._records_read = state, state.records_read
         self._stamps, self._source_stamps = (array("q", part.tobytes()) for part in (state.stamps, state.source_stamps))
 
     @property
     def state(self) -> LogProgress:
         """The progress as a value."""
-        running, source = np.array(self._stamps, np.int64), np.array(self._source_stamps, np.int64)
-        return LogProgress(
-            self._records_read,
-            running,
-            source,
-            self._first_scans,
-            self._earlier_trajectory,
-            self._clock_offset,
-            self._checksum,
-        )
+        stamps, source_stamps = np.array(self._stamps, np.int64), np.array(self._source_stamps, np.int64)
+        return replace(self._progress, records_read=self._records_read, stamps=stamps, source_stamps=source_stamps)
 
     @property
     def scans_read(self) -> int:
         """Number of scans read of the newest log."""
-        return len(self._stamps) - self._first_scans[-1]
+        return len(self._stamps) - self._progress.first_scans[-1]
 
     @property
     def stamp_bytes(self) -> int:
@@ -97,16 +84,20 @@ class LogReader:
 
     def begin_log(self, log: Log) -> None:
         """Begin a further log. The map's clock continues after the last scan."""
-        self._first_scans = (*self._first_scans, len(self._stamps))
         first = next((record.measurement.stamp for record in log.records()), 0)
-        self._records_read, self._clock_offset = 0, self._stamps[-1] + _BETWEEN_LOGS - first
+        self._progress = replace(
+            self._progress,
+            first_scans=(*self._progress.first_scans, len(self._stamps)),
+            clock_offset=self._stamps[-1] + _BETWEEN_LOGS - first,
+        )
+        self._records_read = 0
 
     def unread_records(self, log: Log) -> Iterator[LogRecord]:
         """The unread records of the newest log, with stamps on the map's clock.
 
         :raises HmtSlamError: where the records that were read differ from those of the log.
         """
-        first = self._first_scans[-1]
+        first = self._progress.first_scans[-1]
         scans = zip(self._stamps[first:], self._source_stamps[first:], strict=True)
         records = map(self._to_map_clock, log.records())
         for record in itertools.islice(records, self._records_read):
@@ -127,17 +118,14 @@ class LogReader:
         self._records_read += 1
         if isinstance(record.measurement, Scan):
             if not self.scans_read:
-                self._checksum = _checksum(record.measurement)
+                self._progress = replace(self._progress, checksum=_checksum(record.measurement))
             running, source = _scan_stamps(record)
             self._stamps.append(running)
             self._source_stamps.append(source)
 
     def _to_map_clock(self, record: LogRecord) -> LogRecord:
-        if not self._clock_offset:
-            return record
-        return replace(
-            record, measurement=replace(record.measurement, stamp=record.measurement.stamp + self._clock_offset)
-        )
+        offset, measurement = self._progress.clock_offset, record.measurement
+        return replace(record, measurement=replace(measurement, stamp=measurement.stamp + offset)) if offset else record
 
 
 def _scan_stamps(record: LogRecord) -> tuple[int, int]:

@@ -154,7 +154,8 @@ def write_output(
     write_graph(directory / "graph.g2o", recording)
     write_probabilities(directory / "pmf.csv", recording.probabilities)
     write_cost(directory / "cost.csv", figures.seconds_per_scan)
-    write_report(directory / "report.json", build_report(recording, configuration, figures))
+    report = json.dumps(build_report(recording, configuration, figures), indent=1, allow_nan=False)
+    (directory / "report.json").write_text(report + "\n", encoding="utf-8")
     # matplotlib is loaded only here, after the processes have released their memory.
     from hmt_slam_ros.results.plots import plot_map  # noqa: PLC0415
 
@@ -236,11 +237,6 @@ def build_report(recording: Recording, configuration: Configuration, figures: Ru
         "configuration": as_nested(configuration),
         "versions": _versions(),
     }
-
-
-def write_report(path: Path, content: Mapping[str, Any]) -> None:
-    """Write report.json."""
-    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _cost_summary(seconds: NDArray[np.float64]) -> dict[str, float]:

@@ -37,10 +37,10 @@ from hmt_slam_ros.results.record import EstimateTable, ProbabilityTable, RunReco
 from hmt_slam_ros.results.trajectories import (
     AreaPoseUpdate,
     OnlineEstimate,
-    OnlineTrajectory,
     RelativeTrajectory,
     Trajectory,
     complete_trajectory,
+    online_trajectory,
     relative_trajectory_of,
     trajectory_in_map,
 )
@@ -209,8 +209,9 @@ class Recorder:
             AreaPoseUpdate(keyframe.scan.stamp, {entry.area: entry.pose.mean for entry in decision.global_poses})
             for keyframe, decision in zip(keyframes, decisions, strict=True)
         ]
-        poses = OnlineTrajectory({entry.area: entry.pose.mean for entry in past.global_poses}, previous)
-        return poses.advance([self.estimates[scan] for scan in sorted(self.estimates)], updates)
+        estimates = [self.estimates[scan] for scan in sorted(self.estimates)]
+        area_poses = {entry.area: entry.pose.mean for entry in past.global_poses}
+        return online_trajectory(estimates, updates, area_poses, previous)
 
     def finish(
         self, stamps: NDArray[np.int64], first_scans: tuple[int, ...] = (0,), earlier: RelativeTrajectory | None = None

@@ -124,37 +124,33 @@ class AreaPoseUpdate(NamedTuple):
     area_poses: Mapping[int, NDArray[np.float64]]
 
 
-class OnlineTrajectory:
-    """``map_T_base`` of each scan as it was estimated at the time of the scan.
+def online_trajectory(
+    estimates: Sequence[OnlineEstimate],
+    updates: Sequence[AreaPoseUpdate],
+    area_poses: Mapping[int, NDArray[np.float64]],
+    previous: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+) -> Trajectory:
+    """``map_T_base`` of scans as it was estimated at the time of each scan, shape (n, 3).
 
     An update holds for the scans after its keyframe. In an area without a pose the odometry continues the last pose.
+
+    :param estimates: estimates of the n scans, in their order.
+    :param updates: poses of areas, in the order of their stamps.
+    :param area_poses: {area: ``map_T_area``} of the last update before these; empty before the first.
+    :param previous: ``map_T_base`` and ``odom_T_base``, shape (3,), of the scan before these; None before the first.
     """
-
-    def __init__(
-        self, areas: Mapping[int, NDArray[np.float64]], previous: tuple[NDArray[np.float64], NDArray[np.float64]] | None
-    ) -> None:
-        """:param areas: {area: ``map_T_area``} of the last update; empty before the first.
-
-        :param previous: ``map_T_base`` and ``odom_T_base``, shape (3,), of the last scan; None before the first.
-        """
-        self._area_poses = areas or {FIRST_AREA: np.zeros(3)}
-        self._previous = previous
-
-    def advance(self, estimates: Sequence[OnlineEstimate], updates: Sequence[AreaPoseUpdate]) -> Trajectory:
-        """The poses of the next scans, shape (n, 3)."""
-        poses, applied = np.zeros((len(estimates), 3)), 0
-        for k, estimate in enumerate(estimates):
-            while applied < len(updates) and updates[applied].stamp < estimate.stamp:
-                self._area_poses = updates[applied].area_poses or self._area_poses
-                applied += 1
-            poses[k] = self._pose_in_map(estimate)
-            self._previous = (poses[k], estimate.odometry)
-        return poses
-
-    def _pose_in_map(self, estimate: OnlineEstimate) -> NDArray[np.float64]:
-        if estimate.area in self._area_poses or self._previous is None:
-            return se2.compose(self._area_poses.get(estimate.area, np.zeros(3)), estimate.pose)
-        return se2.compose(self._previous[0], se2.between(self._previous[1], estimate.odometry))
+    area_poses = area_poses or {FIRST_AREA: np.zeros(3)}
+    poses, applied = np.zeros((len(estimates), 3)), 0
+    for k, estimate in enumerate(estimates):
+        while applied < len(updates) and updates[applied].stamp < estimate.stamp:
+            area_poses = updates[applied].area_poses or area_poses
+            applied += 1
+        if estimate.area in area_poses or previous is None:
+            poses[k] = se2.compose(area_poses.get(estimate.area, np.zeros(3)), estimate.pose)
+        else:
+            poses[k] = se2.compose(previous[0], se2.between(previous[1], estimate.odometry))
+        previous = (poses[k], estimate.odometry)
+    return poses
 
 
 def _rows_of_stamps(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.intp]:
