@@ -103,11 +103,13 @@ class PlainDataReader:
         def read(content: object, path: str) -> object:
             if not isinstance(content, dict):
                 raise self.error_at(path, content, "an object")
-            missing, unknown = readers.keys() - content.keys(), content.keys() - readers.keys()
-            for name in missing or unknown:
+            for name in readers.keys() - content.keys():
                 raise HmtSlamError(
-                    f"{path}.{name} is {'missing' if missing else 'unknown'}: see {self.format_reference} for the form "
-                    "of the document"
+                    f"{path}.{name} is missing: see {self.format_reference} for the form of the document"
+                )
+            for name in content.keys() - readers.keys():
+                raise HmtSlamError(
+                    f"{path}.{name} is unknown: see {self.format_reference} for the form of the document"
                 )
             return kind(**{name: reader(content[name], f"{path}.{name}") for name, reader in readers.items()})
 
