@@ -54,9 +54,10 @@ def _tolerate_unwritable_cache(save: Callable[..., None], report: Callable[[str]
         except OSError as fault:
             if not reported:
                 reported = True
-                report(
+                sentence = (
                     f"compiled kernels cannot be kept in {cache.cache_path}: {fault.strerror}; each start compiles "
                     "them anew, which takes up to a minute: make room there, or set NUMBA_CACHE_DIR to another folder"
                 )
+                report(sentence)
 
     return save_if_possible
