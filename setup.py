@@ -42,6 +42,7 @@ setup(
         "networkx>=2.8",
         "numba>=0.59",
         "numpy>=1.26",
+        "Pillow>=10.2",
         "PyYAML>=6.0",
         "rosbags>=0.11",
         "scipy>=1.11",

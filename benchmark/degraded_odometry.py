@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.cli.arguments import build_parser, chosen_configuration
-from hmt_slam_ros.cli.map_command import run_measured
+from hmt_slam_ros.cli.run_commands import run_measured
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2

@@ -1,4 +1,4 @@
-"""Names for the array types of the compiled kernels."""
+"""Short names of array types."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Kernels are compiled once after an installation or a change, which takes half a minute, and kept for later starts."""
+"""Reports on the compilation of kernels, which numba caches for later starts."""
 
 from __future__ import annotations
 
@@ -12,51 +12,52 @@ if TYPE_CHECKING:
 _reporters: list[Callable[[str], None]] = []
 
 
-def report_compilation(say: Callable[[str], None]) -> None:
-    """See to it that ``say`` is called when the first kernel has to be compiled, as its cache has nothing of it.
+def report_compilation(report: Callable[[str], None]) -> None:
+    """Report the first compilation of a kernel that is not cached, and the first failure to cache one.
 
-    And when it cannot be kept, for which numba would end the program: where a disk is full, a node has to go on.
+    numba would raise an exception where the cache cannot be written, such as on a full disk: a node has to continue.
+    Without numba in memory there are no kernels, and numba is not imported. Only the first call has an effect, since a
+    node calls this whenever it is configured.
 
-    A program that has not loaded numba by then has no kernels, and will not load it for this. The first to ask is the
-    only one to be told: a node asks as often as it is configured.
+    :param report: called with a sentence.
     """
     if "numba" not in sys.modules or _reporters:
         return
-    _reporters.append(say)
-    from numba.core import event  # noqa: PLC0415  see above
+    _reporters.append(report)
+    from numba.core import event  # noqa: PLC0415  only where numba is loaded
     from numba.core.caching import Cache  # noqa: PLC0415
 
     class FirstCompilation(event.Listener):
-        told = False
+        reported = False
 
         def on_start(self, _event: object) -> None:
-            if not self.told:
-                self.told = True
-                say("compiling kernels for this machine, once: this takes up to a minute")
+            if not self.reported:
+                self.reported = True
+                report("compiling kernels for this machine, once: this takes up to a minute")
 
         def on_end(self, _event: object) -> None:
             pass
 
-    # Heard only where no cache helps.
+    # The event is sent only for kernels that are not cached.
     event.register("numba:compile", FirstCompilation())
-    Cache.save_overload = _tolerate_unwritable_cache(Cache.save_overload, say)
+    Cache.save_overload = _tolerate_unwritable_cache(Cache.save_overload, report)
 
 
-def _tolerate_unwritable_cache(keep: Callable[..., None], say: Callable[[str], None]) -> Callable[..., None]:
-    """How numba keeps a kernel, but that it goes on without where there is no room; said once."""
-    told = False
+def _tolerate_unwritable_cache(save: Callable[..., None], report: Callable[[str], None]) -> Callable[..., None]:
+    """The method of numba that caches a kernel, with the first failure reported and all ignored."""
+    reported = False
 
-    def keep_if_possible(cache: Cache, signature: object, kernel: object) -> None:
-        nonlocal told
+    def save_if_possible(cache: Cache, signature: object, kernel: object) -> None:
+        nonlocal reported
         try:
-            keep(cache, signature, kernel)
+            save(cache, signature, kernel)
         except OSError as fault:
-            if not told:
-                told = True
+            if not reported:
+                reported = True
                 sentence = (
                     f"compiled kernels cannot be kept in {cache.cache_path}: {fault.strerror}; each start compiles "
                     "them anew, which takes up to a minute: make room there, or set NUMBA_CACHE_DIR to another folder"
                 )
-                say(sentence)
+                report(sentence)
 
-    return keep_if_possible
+    return save_if_possible

@@ -1,8 +1,8 @@
-"""The five processes, made as a configuration asks for them: here the second paper is plugged into the first.
+"""Composition: makes processes with the plug-ins of Tomatis et al. that a configuration asks for.
 
-Lines, landmarks and places come in by three protocols: `submap.local_filter.FilterFactory`,
+Lines, landmarks and places implement three protocols: `submap.local_filter.FilterFactory`,
 `area_abstraction.doors.OpeningDetector` and `topological_inference.landmark_evidence.LandmarkEvidence`. They are
-imported where the configuration asks for them, and by nothing else of the core.
+imported only where the configuration needs them.
 """
 
 from __future__ import annotations
@@ -16,10 +16,8 @@ if TYPE_CHECKING:
     from hmt_slam_ros.area_abstraction.aam import Aam
     from hmt_slam_ros.area_abstraction.doors import OpeningDetector
     from hmt_slam_ros.area_abstraction.partition import AamState
-    from hmt_slam_ros.loop_closure.tlca import Tlca, TlcaState
     from hmt_slam_ros.messages.replica import Replica
     from hmt_slam_ros.metric_slam.slam import MetricSlam, SlamState
-    from hmt_slam_ros.real_time_localization.rtl import Rtl, RtlState
     from hmt_slam_ros.sensors import Scan
     from hmt_slam_ros.submap.local_filter import FilterFactory
     from hmt_slam_ros.submap.local_mapping import LocalMapping
@@ -29,9 +27,9 @@ if TYPE_CHECKING:
 
 
 def metric_slam(configuration: Configuration, state: SlamState | None = None) -> MetricSlam:
-    """Metric SLAM, with filters over lines where ``local_map.kind`` asks for them.
+    """Metric SLAM, with line filters where ``local_map.kind`` asks for them.
 
-    :param state: to go on from.
+    :param state: state from which it continues, None for the start.
     """
     from hmt_slam_ros.metric_slam.slam import MetricSlam  # noqa: PLC0415
 
@@ -39,7 +37,7 @@ def metric_slam(configuration: Configuration, state: SlamState | None = None) ->
 
 
 def filters_for(configuration: Configuration) -> Callable[[LocalMapping], FilterFactory]:
-    """What makes the filters of areas."""
+    """The class of filter factories that ``local_map.kind`` asks for."""
     if configuration.local_map.kind == "grid":
         from hmt_slam_ros.submap.particle_filter import ParticleFilters  # noqa: PLC0415
 
@@ -50,9 +48,9 @@ def filters_for(configuration: Configuration) -> Callable[[LocalMapping], Filter
 
 
 def area_abstraction(configuration: Configuration, state: AamState | None = None) -> Aam:
-    """The AAM, with a detector of openings where ``aam.area_policy`` asks for doors.
+    """The AAM, with an opening detector where ``aam.area_policy`` needs one.
 
-    :param state: to go on from.
+    :param state: state from which it continues, None for the start.
     """
     from hmt_slam_ros.area_abstraction.aam import Aam  # noqa: PLC0415
 
@@ -70,37 +68,17 @@ def _opening_detector(configuration: Configuration) -> OpeningDetector | None:
 def topological_inference(configuration: Configuration, state: TsbiState | None = None) -> Tsbi:
     """TSBI, with the evidence of landmarks where ``places.prior`` or ``places.loops`` asks for it.
 
-    :param state: to go on from.
+    :param state: state from which it continues, None for the start.
     """
     from hmt_slam_ros.topological_inference.tsbi import Tsbi  # noqa: PLC0415
 
     return Tsbi(configuration, branching, state)
 
 
-def loop_closure(configuration: Configuration, state: TlcaState | None = None) -> Tlca:
-    """TLCA.
-
-    :param state: to go on from.
-    """
-    from hmt_slam_ros.loop_closure.tlca import Tlca  # noqa: PLC0415
-
-    return Tlca(configuration, state)
-
-
-def real_time_localization(configuration: Configuration, state: RtlState | None = None) -> Rtl:
-    """Real-time localization.
-
-    :param state: to go on from.
-    """
-    from hmt_slam_ros.real_time_localization.rtl import Rtl  # noqa: PLC0415
-
-    return Rtl(configuration, state)
-
-
 def branching(configuration: Configuration, replica: Replica) -> Branching:
-    """What makes the children of hypotheses, with the evidence of landmarks where that is asked for.
+    """The branching of TSBI, with the evidence of landmarks where the configuration asks for it.
 
-    :param replica: the maps of the live hypotheses.
+    :param replica: maps of the live hypotheses.
     """
     from hmt_slam_ros.topological_inference.branching import Branching  # noqa: PLC0415
 
@@ -108,9 +86,9 @@ def branching(configuration: Configuration, replica: Replica) -> Branching:
 
 
 def landmark_evidence(configuration: Configuration, scans: Mapping[int, Scan]) -> LandmarkEvidence | None:
-    """The evidence of landmarks, None where the configuration asks for none.
+    """The evidence of landmarks, None where the configuration does not ask for it.
 
-    :param scans: {keyframe: scan} of the map, and of what the robot saw last.
+    :param scans: {keyframe: scan} of the map and of the last keyframes.
     """
     if not (configuration.places.prior or configuration.places.loops):
         return None

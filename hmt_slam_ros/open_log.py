@@ -1,4 +1,4 @@
-"""The one way in: any log, whatever its format."""
+"""Opens logs of all formats."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hmt_slam_ros.logs.rawlog import is_rawlog, open_rawlog
 from hmt_slam_ros.logs.records import SIMULATION_PREFIX, Log, TimeWindow
 
 _MCAP, _SQLITE, _GZIP, _XZ = b"\x89MCAP0\r\n", b"SQLite format 3\x00", b"\x1f\x8b", b"\xfd7zXZ\x00"
+"""First bytes of files."""
 
 
 def open_log(
@@ -23,20 +24,19 @@ def open_log(
     start: float = 0.0,
     duration: float | None = None,
 ) -> Log:
-    """Open a rosbag2 (folder, .mcap, .db3), a CARMEN log (plain, .gz, .xz) or an MRPT rawlog; content tells which.
+    """Open a rosbag2 (folder, .mcap, .db3), a CARMEN log (plain, .gz, .xz) or an MRPT rawlog, by its content.
 
     :param path: file or folder, or ``sim:WORLD,name=value,...`` for a simulated drive (docs/guides/simulation.md).
-    :param scan_topic: of a bag; where the default is missing, the only topic with scans serves.
-    :param odom_topic: of a bag; likewise, and without any, the transform odom -> base on /tf.
-    :param start: seconds from the log's first stamp at which the wanted part begins.
-    :param duration: seconds of the wanted part, None for the rest.
-    :raises HmtSlamError: one sentence where there is no such file, it is of no known format, truncated, damaged,
-        or lacks what is asked for.
+    :param scan_topic: topic of a bag; where the default is missing, the only topic with scans.
+    :param odom_topic: topic of a bag, chosen likewise; without any, the transform odom -> base on /tf.
+    :param start: start of the part to read after the log's first stamp, s.
+    :param duration: duration of that part, s, None for the rest.
+    :raises HmtSlamError: where the file is missing, of unknown format, truncated or damaged, or lacks scans, odometry
+        or a topic.
     """
     window = TimeWindow(start, duration)
     if is_simulated(path):
-        # The simulation makes logs, so it imports this package; and its kernels are for those who simulate.
-        from hmt_slam_ros.simulation.simulated_log import open_simulated  # noqa: PLC0415
+        from hmt_slam_ros.simulation.simulated_log import open_simulated  # noqa: PLC0415  it loads kernels of its own
 
         return open_simulated(path, window)
     path = Path(path)
@@ -53,7 +53,7 @@ def open_log(
 
 
 def is_simulated(path: str | Path) -> bool:
-    """Whether a log is made while it is read, and no file."""
+    """Whether a path names a simulated log."""
     return str(path).startswith(SIMULATION_PREFIX)
 
 
@@ -64,8 +64,7 @@ def is_bag(path: str | Path) -> bool:
 
 
 def _open_bag(path: Path, window: TimeWindow, scan_topic: str, odom_topic: str) -> Log:
-    # Its library takes memory that the other formats need not pay for.
-    from hmt_slam_ros.logs.bag import BagLog  # noqa: PLC0415
+    from hmt_slam_ros.logs.bag import BagLog  # noqa: PLC0415  the rosbags library takes memory
 
     return BagLog(path, window, scan_topic, odom_topic)
 
@@ -103,7 +102,7 @@ def _check_suffix(path: Path, suffix: str) -> Path:
 
 
 def _decompress(path: Path, head: bytes) -> bytes:
-    """The file's content, decompressed."""
+    """The content of a file, decompressed."""
     content = path.read_bytes()
     try:
         if head.startswith(_GZIP):

@@ -1,8 +1,8 @@
-"""Values of annotated types as plain data, which JSON can hold, and back, strictly checked.
+"""Conversion of annotated values to plain data, which JSON can store, and back, with strict checks.
 
-The form follows from the annotations: a dataclass or a named tuple is an object with exactly its fields, a tuple is a
-list, a set is a list in order, a mapping is a list of pairs in its own order. A float comes back with the same bits.
-Each dataclass of a union has a field ``kind`` with a word of its own, by which it is told from the others.
+The form follows from the annotations. A dataclass or a named tuple is an object with exactly its fields, a tuple is a
+list, a set is a sorted list, a mapping is a list of pairs in its own order. Floats keep their bits. Each dataclass of a
+union has a field ``kind`` with a word of its own.
 """
 
 from __future__ import annotations
@@ -20,18 +20,16 @@ from hmt_slam_ros.errors import HmtSlamError
 
 Value = TypeVar("Value")
 Reader = Callable[[object, str], object]
-"""Turns parsed plain data, found at a path in a document, into a value, or refuses it."""
-
+"""Converts plain data at a path in a document into a value, or raises an error."""
 
 ReaderFactory = Callable[[str, Hashable], Reader]
-"""Makes a reader for a field of some name and annotation."""
+"""Makes the reader of a field, by its name and annotation."""
 
 
-def to_plain(value: object, forms: Mapping[type, Callable[[Any], object]]) -> Any:  # noqa: ANN401  what JSON can hold
+def to_plain(value: object, forms: Mapping[type, Callable[[Any], object]]) -> Any:  # noqa: ANN401  any JSON value
     """A value as plain data.
 
-    :param forms: {type: what makes plain data of its values}, of types that are no dataclasses, tuples and so on, such
-        as arrays.
+    :param forms: {type: conversion of its values to plain data}, for other types, such as arrays.
     """
     if value is None or type(value) in (int, float, str, bool):
         return value
@@ -48,37 +46,37 @@ def to_plain(value: object, forms: Mapping[type, Callable[[Any], object]]) -> An
 
 
 class PlainDataReader:
-    """Turns plain data back into values.
+    """Converts plain data into values.
 
-    :ivar format_reference: where the form of the documents is described, for the advice in a complaint.
+    :ivar format_reference: description of the documents, for error messages.
     """
 
-    def __init__(self, described: str, forms: Mapping[type, ReaderFactory]) -> None:
-        """:param forms: {type: what makes a reader of its values}, of types that are no dataclasses and so on."""
-        self.format_reference = described
+    def __init__(self, format_reference: str, forms: Mapping[type, ReaderFactory]) -> None:
+        """:param forms: {type: factory of readers}, for other types, such as arrays."""
+        self.format_reference = format_reference
         self._forms = forms
         self._readers: dict[tuple[str, Hashable], Reader] = {}
 
     def read(self, content: object, kind: type[Value], path: str) -> Value:
-        """The value that plain data stands for.
+        """The value of plain data.
 
-        :param kind: its type.
-        :param path: what the document is called in a complaint.
-        :raises HmtSlamError: where it is something else; names the field.
+        :param kind: type of the value.
+        :param path: name of the document, for error messages.
+        :raises HmtSlamError: where the data has another form; names the field.
         """
         return cast(Value, self._reader("", cast(Hashable, kind))(content, path))
 
     def _reader(self, field: str, kind: Hashable) -> Reader:
-        known = self._readers.get((field, kind))
-        if known is None:
-            known = self._readers[field, kind] = self._new_reader(field, kind)
-        return known
+        reader = self._readers.get((field, kind))
+        if reader is None:
+            reader = self._readers[field, kind] = self._new_reader(field, kind)
+        return reader
 
     def _new_reader(self, field: str, kind: Hashable) -> Reader:
         origin, arguments = get_origin(kind), get_args(kind)
-        own = self._forms.get(cast(type, origin or kind))
-        if own is not None:
-            return own(field, kind)
+        factory = self._forms.get(cast(type, origin or kind))
+        if factory is not None:
+            return factory(field, kind)
         if kind in _SCALARS:
             return self._number if kind is float else self._scalar(*_SCALARS[kind])
         if is_record(kind):
@@ -117,11 +115,11 @@ class PlainDataReader:
 
         return read
 
-    def _list(self, item: Reader, made: Callable[..., object]) -> Reader:
+    def _list(self, item: Reader, collection: Callable[..., object]) -> Reader:
         def read(content: object, path: str) -> object:
             if not isinstance(content, list):
                 raise self.error_at(path, content, "a list")
-            return made(item(entry, f"{path}[{k}]") for k, entry in enumerate(content))
+            return collection(item(entry, f"{path}[{k}]") for k, entry in enumerate(content))
 
         return read
 
@@ -137,23 +135,22 @@ class PlainDataReader:
         pairs = self._list(self._fixed_tuple([key, item]), dict)
 
         def read(content: object, path: str) -> object:
-            found = pairs(content, path)
-            if len(cast(dict[Any, Any], found)) < len(cast(list[Any], content)):
+            mapping = pairs(content, path)
+            if len(cast(dict[Any, Any], mapping)) < len(cast(list[Any], content)):
                 raise self.error_at(path, content, "a list of pairs with different keys")
-            return found
+            return mapping
 
         return read
 
     def _union(self, field: str, arguments: tuple[Any, ...]) -> Reader:
-        some = [argument for argument in arguments if argument is not type(None)]
-        found = self._reader(field, some[0]) if len(some) == 1 else self._tagged(some)
-        return found if len(some) == len(arguments) else self._optional(found)
-
-    def _optional(self, some: Reader) -> Reader:
-        return lambda content, path: None if content is None else some(content, path)
+        kinds = [argument for argument in arguments if argument is not type(None)]
+        reader = self._reader(field, kinds[0]) if len(kinds) == 1 else self._tagged(kinds)
+        if len(kinds) == len(arguments):
+            return reader
+        return lambda content, path: None if content is None else reader(content, path)
 
     def _tagged(self, kinds: list[type]) -> Reader:
-        """Of one of some dataclasses, told apart by the words of their fields ``kind``."""
+        """The reader of a union of dataclasses, by the word in the field ``kind``."""
         readers = {get_args(get_type_hints(kind)["kind"])[0]: self._reader("", kind) for kind in kinds}
 
         def read(content: object, path: str) -> object:
@@ -188,7 +185,7 @@ class PlainDataReader:
         return float(content)
 
     def error_at(self, path: str, content: object, wanted: str) -> HmtSlamError:
-        """The complaint about what was found at a path."""
+        """The error for content at a path that is not as wanted."""
         return HmtSlamError(
             f"{path} = {str(content)[:60]} is not {wanted}: see {self.format_reference} for the document's form"
         )
@@ -201,7 +198,7 @@ def is_record(kind: object) -> bool:
 
 @cache
 def field_names(kind: type) -> tuple[str, ...]:
-    """The names of the fields of a dataclass or named tuple; one that is no argument is worked out anew."""
+    """Names of the fields of a dataclass or named tuple, without those that are no arguments of the class."""
     return tuple(entry.name for entry in fields(kind) if entry.init) if is_dataclass(kind) else cast(Any, kind)._fields
 
 
@@ -211,3 +208,4 @@ _SCALARS: dict[Hashable, tuple[type, str]] = {
     float: (float, "a finite number"),
     str: (str, "a text"),
 }
+"""{annotation: (exact type, description)} of scalars."""

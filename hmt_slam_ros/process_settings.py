@@ -1,4 +1,4 @@
-"""Settings of the whole OS process, for the commands and the nodes; to be made before numpy is loaded."""
+"""Settings of the OS process, for commands and nodes. They must be applied before numpy is imported."""
 
 from __future__ import annotations
 
@@ -6,24 +6,23 @@ import ctypes
 import os
 import signal
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # <malloc.h>
-_MMAP_THRESHOLD, _TRIM_THRESHOLD = 1 << 18, 1 << 21  # bytes
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+"""Parameters of mallopt(3)."""
+
+_MMAP_THRESHOLD, _TRIM_THRESHOLD = 1 << 18, 1 << 21
+"""Least size of an allocation that is mapped on its own, and least free memory at the end of the heap, bytes."""
 
 
 def apply_process_settings() -> None:
-    """One thread for BLAS, and large arrays apart from small objects.
+    """Set one thread for BLAS, and fixed thresholds of malloc.
 
-    The matrices here are small, so that several threads of BLAS would spend more time in waiting for each other than in
-    computing; and the order in which they add up, and with it the last bits of a result, would depend on the machine.
-    ``OPENBLAS_NUM_THREADS`` in the environment goes before.
+    The matrices are small: several threads of BLAS take longer, and make the last bits of a sum depend on the machine.
+    ``OPENBLAS_NUM_THREADS`` in the environment takes precedence.
 
-    glibc's malloc maps large arrays one by one, and unmaps them when they are freed, but raises the bound from which on
-    it does so up to 32 MB with every such array. What it takes from the heap instead, later small objects keep from
-    going back: a tenth of a run's memory. With a bound of 1 MB the columns of a run's record, which grow through all
-    sizes, still left hole after hole in the heap: 11 MB in three passes over Intel, 5 with this one, at no cost that
-    shows. A bound that was set stays; but then so does the other one, of 128 kB, from
-    which on free memory at the end of the heap is given back at once, so that every map of an area has its pages made
-    anew. Two megabytes are kept for the next.
+    malloc maps large arrays one by one and unmaps them when they are freed, but raises the threshold with each freed
+    array, up to 32 MB. Smaller arrays then fragment the heap: 11 MB in three passes over Intel with a threshold of
+    1 MB, 5 MB with this one. A fixed threshold also fixes the trim threshold, at 128 kB, with which the pages of every
+    submap are mapped again. So this one is set too.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
@@ -33,6 +32,6 @@ def apply_process_settings() -> None:
 
 
 def exit_on_signals() -> None:
-    """Let SIGINT and SIGTERM end this process at once and as if all was well: for a node that is still being loaded."""
+    """Exit at once with status 0 on SIGINT and SIGTERM, for a node that is still importing."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))

@@ -1,7 +1,7 @@
-"""Processes, their messages and their nodes: one row a process; both runtimes, doctor, page and packaging read it.
+"""The process table: processes, their messages and nodes, for both runtimes, doctor, live page and packaging.
 
-A new process is a new row in :data:`PROCESSES`. Only the standard library is imported, so that ``setup.py`` and launch
-files can read the table; names are resolved when they are needed.
+A new process is a new row in :data:`PROCESSES`. The module imports only the standard library, so that ``setup.py`` and
+launch files can read it. Names are resolved when they are needed.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ COORDINATOR = "slam"
 class NodeRow:
     """A node.
 
-    :ivar name: of the node, and of its executable.
-    :ivar title: what it does, a few words.
-    :ivar node_module: module with its function ``main``, empty where :data:`RUN_NODE` makes it.
+    :ivar name: name of the node and of its executable.
+    :ivar title: its purpose in a few words.
+    :ivar node_module: module with its function ``main``, empty where :data:`RUN_NODE` makes the node.
     :ivar consumes: names of the message classes that it receives.
     """
 
@@ -44,7 +44,7 @@ class ProcessRow(NodeRow):
 
     Its messages include at least one of the chain Keyframe, AreaEvents, Hypotheses, ClosureDecision.
 
-    :ivar factory: "module:function", which makes the process of (configuration, state or None).
+    :ivar factory: "module:function" or "module:Class" that makes the process from a configuration and a state or None.
     :ivar state: "module:Class" of its state; without arguments the class is the state before the first message.
     :ivar produces: names of the message classes that it sends; ``Notice`` is implied.
     """
@@ -62,7 +62,7 @@ class ProcessRow(NodeRow):
         """Make the process.
 
         :param configuration: all parameters.
-        :param state: to go on from, None for the start.
+        :param state: state from which it continues, None for the start.
         """
         return resolve(self.factory)(configuration, state)
 
@@ -74,7 +74,7 @@ class DocumentRow:
     :ivar message: "module:Class" of the message.
     :ivar topic: name of the topic, relative to the namespace.
     :ivar document: name of the document.
-    :ivar version: of the document; raise it with every change of the class.
+    :ivar version: version of the document; raise it with every change of the class.
     """
 
     message: str
@@ -88,7 +88,6 @@ class DocumentRow:
         return resolve_class(self.message)
 
 
-# Messages are delivered in the order of the rows.
 PROCESSES: tuple[ProcessRow, ...] = (
     ProcessRow(
         name="slam",
@@ -121,7 +120,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
         title="loop closure acceptance and the global map",
         node_module=f"{_ROS}.tlca_node",
         consumes=("Keyframe", "Hypotheses"),
-        factory=f"{_COMPOSITION}:loop_closure",
+        factory="hmt_slam_ros.loop_closure.tlca:Tlca",
         state="hmt_slam_ros.loop_closure.tlca:TlcaState",
         produces=("ClosureDecision",),
     ),
@@ -130,11 +129,12 @@ PROCESSES: tuple[ProcessRow, ...] = (
         title="real-time localization",
         node_module=f"{_ROS}.rtl_node",
         consumes=("Odometry", "TrackingReset", "LocalEstimate", "Hypotheses", "ClosureDecision"),
-        factory=f"{_COMPOSITION}:real_time_localization",
+        factory="hmt_slam_ros.real_time_localization.rtl:Rtl",
         state="hmt_slam_ros.real_time_localization.rtl:RtlState",
         produces=("RealTimePose",),
     ),
 )
+"""The processes, in the order in which messages are delivered."""
 
 COMPANIONS: tuple[NodeRow, ...] = (
     NodeRow("robot", "replay of a log, or simulation", f"{_ROS}.robot_node", ("VelocityCommand", "TaskResult")),
@@ -159,7 +159,7 @@ RECORDER = NodeRow(
     "recording for the output folder",
     consumes=("Keyframe", "Hypotheses", "ClosureDecision", "ScanPoses", "LocalEstimate", "EndOfRun", "Notice"),
 )
-"""The listener of both runtimes; in a replay its node lives in the process that started the others."""
+"""The recorder of both runtimes. In a replay, its node runs in the OS process that started the others."""
 
 DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow(f"{_DOCUMENTS}:KeyframeHeader", "hmt/keyframes", "keyframe", 10),
@@ -177,9 +177,10 @@ DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow(f"{_DOCUMENTS}:ResetResponse", "hmt/reset_response", "reset_response", 1),
     DocumentRow("hmt_slam_ros.messages.tasks:PlaceEstimate", "pilot/place_estimate", "place_estimate", 2),
 )
+"""Messages that travel as JSON documents."""
 
 
-def resolve(reference: str) -> Any:  # noqa: ANN401  whatever has that name
+def resolve(reference: str) -> Any:  # noqa: ANN401  any object
     """The object that "module:name" refers to."""
     module, _, name = reference.partition(":")
     return getattr(import_module(module), name)
@@ -198,7 +199,7 @@ def process_names() -> tuple[str, ...]:
 
 
 def participant_names() -> tuple[str, ...]:
-    """Names of the processes that the coordinator asks."""
+    """Names of the processes that answer coordinated requests."""
     return tuple(name for name in process_names() if name != COORDINATOR)
 
 

@@ -1,4 +1,4 @@
-"""Counter-based random streams: what is drawn depends on what for and when, never on the order of execution."""
+"""Counter-based random streams: a draw depends on purpose and step, never on the order of execution."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 class Purpose(IntEnum):
-    """What the numbers are for."""
+    """The purpose of random numbers."""
 
     PARTICLES = 1
     RESAMPLING = 2
@@ -22,13 +22,13 @@ class Purpose(IntEnum):
 
 
 def random_stream(seed: int, purpose: Purpose, step: int) -> np.random.Generator:
-    """The generator of one decision.
+    """The generator for one purpose at one step.
 
-    All hypotheses draw the same numbers: where two have the same map and the same past they stay the same, and the
-    ratio of their evidence carries no noise of sampling.
+    All hypotheses draw the same numbers. Those with the same map and past stay equal, and the ratio of their evidence
+    has no sampling noise.
 
     :param seed: seed of the run, below 2**64.
-    :param purpose: what the numbers are for.
-    :param step: keyframe event, scan, piece of furniture or person, from 0.
+    :param purpose: purpose of the numbers.
+    :param step: number of the keyframe event, scan, piece of furniture or person, from 0.
     """
     return np.random.Generator(np.random.Philox(key=[seed, int(purpose)], counter=[0, 0, 0, step]))

@@ -65,7 +65,7 @@ def test_help_imports_nothing_heavy() -> None:
 
 def test_mapping_loads_no_library_that_it_does_not_use() -> None:
     code = (
-        "import sys; import hmt_slam_ros.cli.map_command;"
+        "import sys; import hmt_slam_ros.cli.run_commands;"
         "print(sorted({'networkx', 'rosbags', 'matplotlib', 'rclpy'} & set(sys.modules)))"
     )
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -9,7 +9,7 @@ import pytest
 
 from hmt_slam_ros.cli.main import main
 from hmt_slam_ros.doctor.examination import log_findings
-from hmt_slam_ros.doctor.statistics import FrameTransform, MessageStatistics, ScanHeader, read_scan_header
+from hmt_slam_ros.doctor.frames import FrameTransform, MessageStatistics, ScanHeader, read_scan_header
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.ros_types import LASER_SCAN, typestore

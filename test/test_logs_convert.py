@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_slam_ros.cli.convert_command import convert_log
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.records import InMemoryLog, LogEntry, TimeWindow
 from hmt_slam_ros.logs.writer import write_bag
@@ -71,12 +70,12 @@ def test_headings_at_the_seam_are_kept(tmp_path):
 
 
 def test_a_bag_converted_again_is_the_same(tmp_path):
-    convert_log(MALAGA, tmp_path / "again", storage="sqlite3")
+    write_bag(open_log(MALAGA), tmp_path / "again", storage="sqlite3")
     assert_same_log(open_log(MALAGA), open_log(tmp_path / "again"))
 
 
 def test_a_part_of_a_log_can_be_converted(tmp_path):
-    convert_log(MALAGA, tmp_path / "part", start=10.0, duration=5.0)
+    write_bag(open_log(MALAGA, start=10.0, duration=5.0), tmp_path / "part")
     assert_same_log(open_log(MALAGA, start=10.0, duration=5.0), open_log(tmp_path / "part"))
 
 
@@ -99,13 +98,13 @@ def test_the_bundled_log_is_what_its_readme_says():
 @pytest.mark.parametrize("storage", ["rar", ""])
 def test_an_unknown_storage_is_refused(tmp_path, storage):
     with pytest.raises(HmtSlamError, match="choose one of mcap, sqlite3"):
-        convert_log(MALAGA, tmp_path / "bag", storage=storage)
+        write_bag(open_log(MALAGA), tmp_path / "bag", storage=storage)
 
 
 def test_an_existing_destination_is_left_alone(tmp_path):
     (tmp_path / "bag").mkdir()
     with pytest.raises(HmtSlamError, match="exists already"):
-        convert_log(MALAGA, tmp_path / "bag")
+        write_bag(open_log(MALAGA), tmp_path / "bag")
     assert list((tmp_path / "bag").iterdir()) == []
 
 
@@ -130,7 +129,7 @@ def test_a_log_that_breaks_off_leaves_nothing_behind(tmp_path):
 def test_a_destination_that_cannot_be_made_is_one_sentence(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(HmtSlamError, match="cannot be written"):
-        convert_log(MALAGA, tmp_path / "file" / "bag")
+        write_bag(open_log(MALAGA), tmp_path / "file" / "bag")
 
 
 def dataset(name):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from misled import misled
 
-from hmt_slam_ros.cli import map_command
+from hmt_slam_ros.cli import run_commands
 from hmt_slam_ros.cli.arguments import build_parser
 from hmt_slam_ros.configuration import Configuration, load_configuration, with_changes
 from hmt_slam_ros.errors import HmtSlamError
@@ -210,7 +210,7 @@ def test_the_command_goes_on_with_the_parameters_of_the_map_which_it_may_replace
 def test_what_cannot_go_on_is_refused_and_nothing_is_left(first, tmp_path, options, sentence):
     arguments = ["map", str(LOG), "--out", str(tmp_path / "out"), "--from", str(first), *options]
     with pytest.raises(HmtSlamError, match=sentence):
-        map_command.run(build_parser().parse_args(arguments))
+        run_commands.run_map(build_parser().parse_args(arguments))
     assert list(tmp_path.iterdir()) == []
 
 

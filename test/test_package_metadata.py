@@ -140,7 +140,7 @@ def imported_names(files):
 def python_packages(setup_arguments):
     """The modules of the packages that pip is to install."""
     names = (re.split(r"[<>=]", requirement)[0] for requirement in setup_arguments["install_requires"])
-    return {name.lower().replace("pyyaml", "yaml") for name in names}
+    return {{"PyYAML": "yaml", "Pillow": "PIL"}.get(name, name) for name in names}
 
 
 def test_every_third_party_import_is_a_declared_dependency(python_packages):
@@ -153,10 +153,12 @@ def test_every_third_party_import_is_a_declared_dependency(python_packages):
 def test_pip_and_rosdep_ask_for_the_same_python_packages_but_for_numba_which_rosdep_cannot_give(python_packages):
     keys = {str(element.text) for element in package_xml().findall("exec_depend")}
     rosdep = {key.removeprefix("python3-").removesuffix("-pip") for key in keys if key.startswith("python3-")}
-    assert python_packages == rosdep | {"numba"}
+    assert {name.lower() for name in python_packages} == rosdep | {"numba"}
 
 
-@pytest.mark.parametrize("requirement", ["numpy", "scipy", "networkx", "numba", "matplotlib", "rosbags", "PyYAML"])
+@pytest.mark.parametrize(
+    "requirement", ["numpy", "scipy", "networkx", "numba", "matplotlib", "Pillow", "rosbags", "PyYAML"]
+)
 def test_the_floor_that_is_tested_is_the_floor_that_setup_py_promises(setup_arguments, requirement):
     promised = next(line for line in setup_arguments["install_requires"] if line.startswith(requirement))
     floor = (ROOT / "requirements" / "floor.txt").read_text()

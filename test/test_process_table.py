@@ -90,11 +90,11 @@ def test_lock_step_delivers_its_messages_and_a_saved_map_has_its_state(with_row,
 
 
 def examine_without_it():
-    from hmt_slam_ros.doctor.running import RunningSystem, Topic, findings  # noqa: PLC0415  as above
+    from hmt_slam_ros.doctor.running import RunningSystem, Topic, running_findings  # noqa: PLC0415  as above
 
     others = tuple(name for name in process_names() if name != NAME)
     topics = defaultdict(lambda: Topic(1, ("driver",)))
-    told = [finding.text for finding in findings(RunningSystem(1.0, topics, others, (), (), {}, {}, ""))]
+    told = [finding.text for finding in running_findings(RunningSystem(1.0, topics, others, (), (), {}, {}, ""))]
     assert any(f"Of the nodes, {NAME} is missing" in text for text in told), told
 
 

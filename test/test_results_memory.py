@@ -6,10 +6,10 @@ import sys
 import numpy as np
 from worlds import box, scan_in
 
-from hmt_slam_ros.results.report import code_bytes, scan_bytes
+from hmt_slam_ros.results.output_folder import code_bytes, scan_bytes
 
 COMPILED = """
-from hmt_slam_ros.results.report import code_bytes
+from hmt_slam_ros.results.output_folder import code_bytes
 before = code_bytes()
 from numba import njit
 njit(lambda x: x + 1)(1)

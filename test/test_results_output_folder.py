@@ -28,9 +28,9 @@ from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.results import plots
 from hmt_slam_ros.results.final_map import FinalMap, final_map
 from hmt_slam_ros.results.hmt_map import MapWriter, read_run_state, read_saved_map
-from hmt_slam_ros.results.output_folder import atomic_output, write_output
+from hmt_slam_ros.results.output_folder import RunMetrics, atomic_output, write_output
+from hmt_slam_ros.results.plots import read_table
 from hmt_slam_ros.results.recorder import Recorder
-from hmt_slam_ros.results.report import RunMetrics, read_table
 from hmt_slam_ros.sensors import Scan
 
 SCANS, EVERY, CUT, VERDICT = 24, 4, 3, 4

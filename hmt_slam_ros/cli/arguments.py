@@ -1,4 +1,4 @@
-"""What can be said on the command line."""
+"""The command line: its parser, and the configuration that it asks for."""
 
 from __future__ import annotations
 
@@ -9,43 +9,49 @@ from typing import NoReturn
 from hmt_slam_ros import __version__
 from hmt_slam_ros.configuration import Configuration, load_configuration
 
-# That of hmt_slam_ros.view.server, which takes too long to load for a help text.
 _VIEW_PORT = 8800
+"""The port of hmt_slam_ros.view.server, which takes too long to load for a help text."""
 _LOG = "rosbag2 folder, .mcap or .db3 file, CARMEN log, MRPT rawlog, or sim:WORLD"
 
 
 class OneSentenceParser(argparse.ArgumentParser):
-    """A parser whose complaint is one line."""
+    """A parser whose error message is one line."""
 
     def error(self, message: str) -> NoReturn:
-        """Leave with exit status 2."""
+        """Print the message and exit with status 2."""
         self.exit(2, f"{self.prog}: {message}: see {self.prog} --help\n")
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of ``hmt_slam``; the name of the subcommand ends up in ``command``."""
+    """The parser of ``hmt_slam``.
+
+    A parsed subcommand has its name in ``command`` and its "module:function" in ``function``.
+    """
     top = OneSentenceParser(prog="hmt_slam", description="Hybrid metric-topological SLAM.")
     top.add_argument("--version", action="version", version=f"hmt_slam_ros {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_map_arguments(commands.add_parser("map", help="map a log, all in one process, the same for one seed"))
-    _add_replay_arguments(commands.add_parser("replay", help="map a log by a simulated robot and the ROS nodes"))
-    _add_convert_arguments(commands.add_parser("convert", help="write a log as a rosbag2"))
-    _add_simulate_arguments(
-        commands.add_parser("simulate", help="write a drive through a simulated world as a rosbag2")
-    )
-    _add_evaluate_arguments(commands.add_parser("evaluate", help="errors of an output folder against true relations"))
-    _add_plot_arguments(commands.add_parser("plot", help="draw map, probabilities and cost of an output folder"))
-    _add_export_arguments(commands.add_parser("export", help="write a map's topology as GraphML, or its grid for nav2"))
-    _add_doctor_arguments(commands.add_parser("doctor", help="say what is wrong with a log or with the running system"))
-    _add_parameters_arguments(commands.add_parser("parameters", help="print every parameter as a YAML file"))
+    for add_arguments, module, name, description in (
+        (_add_map_arguments, "run_commands", "map", "map a log, all in one process, the same for one seed"),
+        (_add_replay_arguments, "run_commands", "replay", "map a log by a simulated robot and the ROS nodes"),
+        (_add_convert_arguments, "log_commands", "convert", "write a log as a rosbag2"),
+        (_add_simulate_arguments, "log_commands", "simulate", "write a drive through a simulated world as a rosbag2"),
+        (_add_evaluate_arguments, "result_commands", "evaluate", "errors of an output folder against true relations"),
+        (_add_plot_arguments, "result_commands", "plot", "draw map, probabilities and cost of an output folder"),
+        (_add_export_arguments, "result_commands", "export", "write a map's topology as GraphML, or its grid for nav2"),
+        (_add_doctor_arguments, "log_commands", "doctor", "say what is wrong with a log or with the running system"),
+        (_add_configuration, "arguments", "parameters", "print every parameter as a YAML file"),
+    ):
+        command = commands.add_parser(name, help=description)
+        command.set_defaults(function=f"hmt_slam_ros.cli.{module}:run_{name}")
+        add_arguments(command)
     return top
 
 
 def chosen_configuration(options: argparse.Namespace, base: Configuration | None = None) -> Configuration:
-    """Defaults, then ``--config``, then ``--set``, then the options that have names of their own.
+    """The configuration of a command: defaults, ``--config``, ``--set``, then the options named like parameters.
 
-    :param base: instead of the defaults.
-    :raises HmtSlamError: for a file, a name or a value that cannot be.
+    :param base: configuration that replaces the defaults.
+    :raises HmtSlamError: for a missing file, an unknown name or an invalid value.
     """
     named = {"mode": "mode", "start": "robot.start", "duration": "robot.duration", "rate": "robot.rate"}
     settings = list(options.settings)
@@ -53,6 +59,13 @@ def chosen_configuration(options: argparse.Namespace, base: Configuration | None
         value = getattr(options, option, None)
         settings += [] if value is None else [f"{name}={value}"]
     return load_configuration(options.config, settings, options.seed, base)
+
+
+def run_parameters(options: argparse.Namespace) -> None:
+    """Print every parameter with its description, as a file that ``--config`` and ROS read."""
+    from hmt_slam_ros.configuration.documents import ros_yaml  # noqa: PLC0415  no other command needs it
+
+    print(ros_yaml(chosen_configuration(options)), end="")
 
 
 def _add_map_arguments(command: argparse.ArgumentParser) -> None:
@@ -147,7 +160,7 @@ def _add_export_arguments(command: argparse.ArgumentParser) -> None:
         "directory", type=Path, metavar="DIR", help="output folder, in which the file is put; for --grid also a hmt_map"
     )
     command.add_argument(
-        "--grid", type=Path, dest="to", metavar="FOLDER", help="write map.pgm and map.yaml for nav2 there instead"
+        "--grid", type=Path, metavar="FOLDER", help="write map.pgm and map.yaml for nav2 there instead"
     )
     command.add_argument("--resolution", type=float, metavar="M", help="side of a cell of the grid; default: as mapped")
     command.add_argument("--area", type=int, metavar="N", help="the grid of one area alone, in that area's frame")
@@ -167,7 +180,3 @@ def _add_doctor_arguments(command: argparse.ArgumentParser) -> None:
         metavar="ARG",
         help="with --live: namespace and remappings, such as -r __ns:=/robot1",
     )
-
-
-def _add_parameters_arguments(command: argparse.ArgumentParser) -> None:
-    _add_configuration(command)

@@ -1,18 +1,19 @@
-"""The command ``hmt_slam``: finds the subcommand and turns its faults into one sentence and an exit status."""
+"""The command ``hmt_slam``: runs a subcommand and turns its faults into one sentence and an exit status."""
 
 from __future__ import annotations
 
 import os
 import sys
 from collections.abc import Sequence
-from importlib import import_module
 
 from hmt_slam_ros.cli.arguments import build_parser
 from hmt_slam_ros.cli.terminal import install_signal_handlers
 from hmt_slam_ros.compilation import report_compilation
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.process_table import resolve
 
 FAULT, INTERRUPTED = 2, 130
+"""Exit status where the input is at fault, and where the user stopped the command."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -25,15 +26,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     install_signal_handlers()
     options = build_parser().parse_args(arguments)
     try:
-        # Each subcommand loads what it needs itself, so that --help does not wait for numba and matplotlib.
-        command = import_module(f"hmt_slam_ros.cli.{options.command}_command")
+        # A subcommand is imported only when it is run, so that --help does not wait for numba and matplotlib.
+        run = resolve(options.function)
         report_compilation(lambda text: print(f"hmt_slam {options.command}: {text}", file=sys.stderr))
-        return command.run(options) or 0
+        return run(options) or 0
     except HmtSlamError as fault:
         print(f"hmt_slam {options.command}: {fault}", file=sys.stderr)
         return FAULT
     except BrokenPipeError:
-        # The reader of the output, such as `head`, has gone; so has what the interpreter would flush at its end.
+        # The reader of the output, such as `head`, has ended. What the interpreter flushes at its end goes nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
         print(f"hmt_slam {options.command}: stopped, nothing was written", file=sys.stderr)

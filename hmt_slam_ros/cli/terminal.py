@@ -1,7 +1,7 @@
-"""What a command says on the terminal, and how it ends when it is told to.
+"""Progress and summary of a command on the terminal, and its end on a signal.
 
-But not inside of numba. It calls Python back from LLVM, which knows no exceptions: what is raised there is lost, and so
-is the kernel that was being loaded, whose address is then taken from nowhere.
+A signal handler must not raise inside numba. Numba calls Python from LLVM, which has no exceptions: the exception would
+be lost, and with it the kernel that is being loaded.
 """
 
 from __future__ import annotations
@@ -13,16 +13,20 @@ import time
 from collections.abc import Callable, Collection
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
-from hmt_slam_ros.results.recorder import Recording
+if TYPE_CHECKING:
+    from hmt_slam_ros.results.recorder import Recording
 
-_TTY_PERIOD, _FILE_PERIOD = 0.1, 10.0  # s
-_BAR = 24  # characters
+_TTY_PERIOD, _FILE_PERIOD = 0.1, 10.0
+"""Least time between two lines of progress, on a terminal and in a file, s."""
+
+_BAR = 24
+"""Width of the progress bar, characters."""
 
 
 class Progress:
-    """Call it with the number of scans done; use it as a context, which ends the moving line."""
+    """Shows the progress of a run. Call it with the number of scans done; as a context it ends the moving line."""
 
     def __init__(
         self,
@@ -33,10 +37,10 @@ class Progress:
     ) -> None:
         """Start the clock.
 
-        :param scans: of the whole log.
-        :param log_seconds: that the log lasts.
-        :param stream: where to write, stderr where None.
-        :param clock: seconds, from any start.
+        :param scans: number of scans of the log.
+        :param log_seconds: duration of the log, s.
+        :param stream: stream to write to, stderr where None.
+        :param clock: returns seconds since any start.
         """
         self._scans, self._log_seconds = max(scans, 1), log_seconds
         self._stream = stream or sys.stderr
@@ -46,7 +50,7 @@ class Progress:
         self._was_shown = False
 
     def __call__(self, done: int) -> None:
-        """Show the state where the last one was shown some time ago, and at the end."""
+        """Write a line where the period since the last one is over, and at the end."""
         now = self._clock()
         due = now - self._last >= (_TTY_PERIOD if self._is_terminal else _FILE_PERIOD)
         if not due and not (self._is_terminal and done >= self._scans):
@@ -57,7 +61,10 @@ class Progress:
         self._stream.flush()
 
     def line(self, done: int, elapsed: float) -> str:
-        """The state in words."""
+        """Bar, count, speed and remaining time.
+
+        :param elapsed: time since the start, s.
+        """
         share = min(done / self._scans, 1.0)
         filled = int(_BAR * share)
         bar = f"[{'#' * filled}{'.' * (_BAR - filled)}] " if self._is_terminal else ""
@@ -67,13 +74,13 @@ class Progress:
         return f"{bar}{done}/{self._scans} scans, {speed:.1f} x real time, {rest}"
 
     def __enter__(self) -> Progress:
-        """Nothing to prepare."""
+        """Nothing is prepared."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave the moving line as it is and go to the next."""
+        """End the moving line."""
         if self._is_terminal and self._was_shown:
             self._stream.write("\n")
 
@@ -84,16 +91,20 @@ def _duration(seconds: float) -> str:
 
 
 TERMINATED = 143
+"""Exit status after SIGTERM."""
 
-# Who is between LLVM and the program. Loading a kernel takes no longer than this; what takes longer compiles one, and
-# can be broken off but for the calls of LLVM themselves.
 _LLVM, _NUMBA = frozenset({"llvmlite"}), frozenset({"llvmlite", "numba"})
-_MAX_DEFERRAL = 2.0  # s
-_RETRY_DELAY = 0.02  # s
+"""Packages between LLVM and the program: no exception may pass calls of LLVM, nor numba while it loads a kernel."""
+
+_MAX_DEFERRAL = 2.0
+"""Longest time that loading a kernel takes, s. What takes longer compiles one, and may be interrupted outside LLVM."""
+
+_RETRY_DELAY = 0.02
+"""Delay until a deferred signal is tried again, s."""
 
 
 class _DeferringHandler:
-    """A handler that raises where the program can bear it, and otherwise tries again a little later."""
+    """A signal handler that raises outside of numba, and inside of it tries again later."""
 
     def __init__(self) -> None:
         self._signal = signal.SIGTERM
@@ -111,14 +122,14 @@ class _DeferringHandler:
 
 
 def install_signal_handlers() -> None:
-    """Raise ``KeyboardInterrupt`` on SIGINT and ``SystemExit`` on SIGTERM from now on, once no kernel is being loaded.
+    """Raise ``KeyboardInterrupt`` on SIGINT and ``SystemExit`` on SIGTERM, but not while a kernel is loaded.
 
-    A SIGINT that was to be ignored stays so.
+    A SIGINT that the parent process ignores stays ignored.
     """
-    stop = _DeferringHandler()
+    handler = _DeferringHandler()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
         if number != signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, stop)
+            signal.signal(number, handler)
 
 
 def _is_inside(frame: FrameType | None, packages: Collection[str]) -> bool:
@@ -130,10 +141,10 @@ def _is_inside(frame: FrameType | None, packages: Collection[str]) -> bool:
 
 
 def summary(directory: Path, recording: Recording, log_seconds: float, wall_seconds: float) -> str:
-    """What the processes had to tell, what came of the run and how long it took.
+    """The notices of the processes, a line each, and one line with counts and speed.
 
-    :param log_seconds: that the log lasts.
-    :param wall_seconds: that the run took.
+    :param log_seconds: duration of the log, s.
+    :param wall_seconds: duration of the run, s.
     """
     arcs = [arc for _, _, arc in recording.hybrid_map.all_arcs()]
     totals = recording.totals

@@ -2,55 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
-from hmt_slam_ros.doctor import beams, frames, odometry, timing
-from hmt_slam_ros.doctor.comparison import compare_odometry
-from hmt_slam_ros.doctor.finding import SEVERITIES, Finding
-from hmt_slam_ros.doctor.gathering import gather
-from hmt_slam_ros.doctor.statistics import MessageStatistics, Statistics
+from hmt_slam_ros.doctor.beams import beam_findings, mounting_findings
+from hmt_slam_ros.doctor.finding import Finding, sorted_findings
+from hmt_slam_ros.doctor.frames import MessageStatistics, frame_findings, read_message_statistics
+from hmt_slam_ros.doctor.odometry import compare_odometry, odometry_findings
+from hmt_slam_ros.doctor.statistics import Statistics, gather
+from hmt_slam_ros.doctor.timing import rate_findings, stamp_findings
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.open_log import is_bag, open_log
 
 
 def examine(path: Path, *, start: float = 0.0, duration: float | None = None) -> list[Finding]:
-    """Read a log and judge it.
+    """The findings on a log, the most serious first.
 
-    :param start: seconds of it to skip.
-    :param duration: seconds of it to use, None for all that follows.
-    :raises HmtSlamError: where it cannot be read.
+    :param start: seconds of the log to skip.
+    :param duration: seconds of the log to use, None for all that follows.
+    :raises HmtSlamError: where the log cannot be read.
     """
     log = open_log(path, start=start, duration=duration)
-    return log_findings(log, _messages(path))
+    return log_findings(log, read_message_statistics(path) if is_bag(path) else None)
 
 
 def log_findings(log: Log, messages: MessageStatistics | None = None) -> list[Finding]:
-    """All findings on a log that is open, the most serious first."""
-    return sorted_findings(findings(gather(log, messages)))
+    """The findings on an open log, the most serious first."""
+    return sorted_findings(statistics_findings(gather(log, messages)))
 
 
-def findings(statistics: Statistics) -> list[Finding]:
-    """All findings on what was gathered."""
+def statistics_findings(statistics: Statistics) -> Iterator[Finding]:
+    """The findings on statistics, in the order of the checks."""
     comparison = compare_odometry(statistics.odometry, statistics.motions)
-    return [
-        *timing.rate_findings(statistics),
-        *timing.stamp_findings(statistics, comparison),
-        *beams.findings(statistics),
-        *odometry.findings(statistics, comparison),
-        *frames.findings(statistics),
-    ]
-
-
-def sorted_findings(found: Sequence[Finding]) -> list[Finding]:
-    """The most serious first."""
-    return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
-
-
-def _messages(path: Path) -> MessageStatistics | None:
-    if not is_bag(path):
-        return None
-    # Its library takes memory that the other formats need not pay for.
-    from hmt_slam_ros.doctor.statistics import read_message_statistics  # noqa: PLC0415
-
-    return read_message_statistics(path)
+    yield from rate_findings(statistics)
+    yield from stamp_findings(statistics, comparison)
+    yield from beam_findings(statistics)
+    yield from odometry_findings(statistics, comparison)
+    yield from mounting_findings(statistics.scans)
+    if statistics.messages is not None:
+        yield from frame_findings(statistics.messages)

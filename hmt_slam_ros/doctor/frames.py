@@ -1,127 +1,235 @@
-"""The frames of the messages and the transforms between them."""
+"""What only ROS messages have: topics, headers, frames and transforms, and the checks on them."""
 
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+import struct
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from rosbags.rosbag2 import Reader
 
 from hmt_slam_ros.doctor.finding import Finding
-from hmt_slam_ros.doctor.statistics import FrameTransform, MessageStatistics, Statistics
+from hmt_slam_ros.logs.bag import (
+    DEFAULT_ODOM_TOPIC,
+    DEFAULT_SCAN_TOPIC,
+    choose_odom_topic,
+    choose_scan_topic,
+    read_header,
+    read_messages,
+    read_topics,
+)
+from hmt_slam_ros.logs.mounting import frame_name, transform_from_message
+from hmt_slam_ros.logs.ros_types import ODOMETRY, TRANSFORMS, RosMessage, deserialize
 
-# A laser tilted by more, rad, has ranges other than those on the floor plan; beyond 10 degrees it is refused.
-_TILT = math.radians(2.0)
-# A laser farther from the robot's middle is no part of it, m.
-_FAR = 2.0
-# A transform that should be fixed moves if a point at 1 m does so by this, m.
-_MOVES = 0.01
+_MAX_TILT = math.radians(2.0)
+"""Tilt from which a laser measures other ranges than those of the floor plan, rad. Beyond 10 degrees it is refused."""
 
-
-def findings(statistics: Statistics) -> list[Finding]:
-    """What frames and transforms tell; nothing where the log is of another format than messages."""
-    found = _check_laser_distance(statistics)
-    messages = statistics.messages
-    if messages is None:
-        return found
-    found += [
-        *_check_names(messages),
-        *_check_parents(messages),
-        *_check_static(messages),
-        *_check_tilt(messages),
-        *_check_map_to_odom(messages),
-    ]
-    odom, base = messages.odometry_frames
-    frames = ", ".join(sorted({head.frame for head in messages.scan_headers}))
-    return [*found, Finding("fine", "frames", f"Odometry is {odom} -> {base}, scans are in {frames}.")]
+_MAX_STATIC_CHANGE = 0.01
+"""Change of a static transform, as the displacement of a point at 1 m, m."""
 
 
-def _check_laser_distance(statistics: Statistics) -> list[Finding]:
-    poses = statistics.scans.laser_poses
-    if not len(poses):
-        return []
-    away = float(np.hypot(poses[:, 0], poses[:, 1]).max())
-    if away <= _FAR:
-        return []
-    text = (
-        f"The laser is said to be {away:.2f} m from the robot's middle: check the unit (m) and the direction of the "
-        "transform base_link -> laser."
+class FrameTransform(NamedTuple):
+    """All messages of one transform.
+
+    :ivar parent: parent frame.
+    :ivar child: child frame.
+    :ivar topic: topic of the messages.
+    :ivar first_transform: shape (4, 4), ``parent_T_child`` of the first message, m.
+    :ivar message_count: number of messages.
+    :ivar max_change: largest change of an element against the first message, m, and at 1 m for a rotation.
+    """
+
+    parent: str
+    child: str
+    topic: str
+    first_transform: NDArray[np.float64]
+    message_count: int
+    max_change: float
+
+
+class ScanHeader(NamedTuple):
+    """Fields of a LaserScan message, some of which `Scan` does not have.
+
+    :ivar frame: frame of the laser.
+    :ivar angle_min: angle of the first beam, rad.
+    :ivar angle_max: angle of the last beam, rad.
+    :ivar angle_increment: angle between beams, rad.
+    :ivar beams: number of beams.
+    """
+
+    frame: str
+    angle_min: float
+    angle_max: float
+    angle_increment: float
+    beams: int
+
+
+@dataclass(frozen=True, eq=False)
+class MessageStatistics:
+    """Statistics of ROS messages; logs of other formats have none.
+
+    :ivar counts: {topic: number of messages}.
+    :ivar types: {topic: message type}.
+    :ivar scan_headers: {header: number of scans that have it}.
+    :ivar odometry_frames: (frame, child frame) of the odometry; the transform's where there is no topic of it.
+    :ivar transforms: all transforms.
+    """
+
+    counts: dict[str, int]
+    types: dict[str, str]
+    scan_headers: dict[ScanHeader, int]
+    odometry_frames: tuple[str, str]
+    transforms: tuple[FrameTransform, ...]
+
+
+class TransformCollector:
+    """Counts the messages of each transform and compares them with the first."""
+
+    def __init__(self) -> None:
+        self._first_transforms: dict[tuple[str, str, str], NDArray[np.float64]] = {}
+        self._message_counts: Counter[tuple[str, str, str]] = Counter()
+        self._max_changes: dict[tuple[str, str, str], float] = {}
+
+    @property
+    def transforms(self) -> tuple[FrameTransform, ...]:
+        """The transforms, in the order of their first messages."""
+        return tuple(
+            FrameTransform(*key, first, self._message_counts[key], self._max_changes[key])
+            for key, first in self._first_transforms.items()
+        )
+
+    def add(self, topic: str, message: RosMessage) -> None:
+        """Add a tf2_msgs/TFMessage."""
+        for stamped in message.transforms:
+            key = (frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id), topic)
+            transform = transform_from_message(stamped.transform)
+            first = self._first_transforms.setdefault(key, transform)
+            self._message_counts[key] += 1
+            self._max_changes[key] = max(self._max_changes.get(key, 0.0), float(np.abs(transform - first).max()))
+
+
+def read_message_statistics(path: Path) -> MessageStatistics:
+    """The statistics of the messages of a bag.
+
+    :raises HmtSlamError: where the bag is damaged.
+    """
+    types = read_topics(path)
+    scan_topic = choose_scan_topic(types, DEFAULT_SCAN_TOPIC, path.name)
+    odom_topic = choose_odom_topic(types, DEFAULT_ODOM_TOPIC, path.name)
+    headers = Counter(read_scan_header(message.content) for message in read_messages(path, {scan_topic}))
+    collector = TransformCollector()
+    for topic in ("/tf_static", "/tf"):
+        for message in read_messages(path, {topic}):
+            if message.kind == TRANSFORMS:
+                collector.add(topic, deserialize(message.content, TRANSFORMS))
+    return MessageStatistics(
+        _message_counts(path),
+        types,
+        dict(headers),
+        _odometry_frames(path, odom_topic, collector.transforms),
+        collector.transforms,
     )
-    return [Finding("wrong", "laser far away", text)]
 
 
-def _check_names(messages: MessageStatistics) -> list[Finding]:
+def _message_counts(path: Path) -> dict[str, int]:
+    with Reader(path) as reader:
+        return {topic: info.msgcount for topic, info in reader.topics.items()}
+
+
+def _odometry_frames(path: Path, topic: str | None, transforms: tuple[FrameTransform, ...]) -> tuple[str, str]:
+    if topic is not None:
+        for message in read_messages(path, {topic}):
+            reading = deserialize(message.content, ODOMETRY)
+            return frame_name(reading.header.frame_id), frame_name(reading.child_frame_id)
+    child = next((transform.child for transform in transforms if transform.parent == "odom"), "")
+    return "odom", child
+
+
+def read_scan_header(content: bytes) -> ScanHeader:
+    """The header of a LaserScan message in CDR, without its ranges."""
+    order = "<" if content[1] & 1 else ">"
+    frame = read_header(content).frame
+    (length,) = struct.unpack_from(order + "I", content, 12)
+    # CDR aligns to four bytes, counted from the end of its own header of four bytes.
+    offset = -(-(16 + length) // 4) * 4
+    first, last, increment, *_, beams = struct.unpack_from(order + "7fI", content, offset)
+    return ScanHeader(frame_name(frame), first, last, increment, beams)
+
+
+def frame_findings(messages: MessageStatistics) -> Iterator[Finding]:
+    """Findings on frames and transforms."""
+    yield from _check_names(messages)
+    yield from _check_parents(messages)
+    yield from _check_static(messages)
+    yield from _check_tilt(messages)
+    yield from _check_map_to_odom(messages)
     odom, base = messages.odometry_frames
-    found = []
+    frames = ", ".join(sorted({header.frame for header in messages.scan_headers}))
+    yield Finding("fine", "frames", f"Odometry is {odom} -> {base}, scans are in {frames}.")
+
+
+def _check_names(messages: MessageStatistics) -> Iterator[Finding]:
+    odom, base = messages.odometry_frames
     if not base:
         text = "The odometry has no child_frame_id: set it to the robot's frame, such as base_link."
-        found.append(Finding("doubtful", "odometry frames", text))
+        yield Finding("doubtful", "odometry frames", text)
     if odom and odom in {base, "map"}:
         text = f"The odometry is given in the frame {odom!r}: its header's frame should be odom (REP 105)."
-        found.append(Finding("doubtful", "odometry frames", text))
-    if any(not head.frame for head in messages.scan_headers):
+        yield Finding("doubtful", "odometry frames", text)
+    if any(not header.frame for header in messages.scan_headers):
         text = "Scans have an empty frame_id: set the frame of the laser in its driver, such as laser."
-        found.append(Finding("wrong", "scan frame", text))
-    return found
+        yield Finding("wrong", "scan frame", text)
 
 
-def _check_parents(messages: MessageStatistics) -> list[Finding]:
+def _check_parents(messages: MessageStatistics) -> Iterator[Finding]:
     parents: dict[str, set[str]] = defaultdict(set)
-    for joint in messages.transforms:
-        parents[joint.child].add(joint.parent)
-    return [
-        Finding(
-            "wrong",
-            "two parents",
-            f"The frame {child!r} is said to be in {' and in '.join(sorted(names))}: a frame has one parent; stop "
-            "one of the publishers (robot_state_publisher, static_transform_publisher, a driver, another SLAM).",
-        )
-        for child, names in parents.items()
-        if len(names) > 1
-    ]
+    for transform in messages.transforms:
+        parents[transform.child].add(transform.parent)
+    for child, names in parents.items():
+        if len(names) > 1:
+            text = (
+                f"The frame {child!r} is said to be in {' and in '.join(sorted(names))}: a frame has one parent; stop "
+                "one of the publishers (robot_state_publisher, static_transform_publisher, a driver, another SLAM)."
+            )
+            yield Finding("wrong", "two parents", text)
 
 
-def _check_static(messages: MessageStatistics) -> list[Finding]:
-    return [
-        Finding(
-            "doubtful",
-            "static transform moves",
-            f"The transform {joint.parent} -> {joint.child} on {joint.topic} changes by {joint.max_change:.3f} m "
-            "though it is static: the first one is believed; look for a second publisher.",
-        )
-        for joint in messages.transforms
-        if joint.topic.endswith("tf_static") and joint.max_change > _MOVES
-    ]
+def _check_static(messages: MessageStatistics) -> Iterator[Finding]:
+    for transform in messages.transforms:
+        if transform.topic.endswith("tf_static") and transform.max_change > _MAX_STATIC_CHANGE:
+            text = (
+                f"The transform {transform.parent} -> {transform.child} on {transform.topic} changes by "
+                f"{transform.max_change:.3f} m though it is static: the first one is believed; look for a second "
+                "publisher."
+            )
+            yield Finding("doubtful", "static transform moves", text)
 
 
-def _check_tilt(messages: MessageStatistics) -> list[Finding]:
-    return [
-        Finding(
-            "doubtful",
-            "tilted",
-            f"The transform {joint.parent} -> {joint.child} is tilted by {math.degrees(_tilt(joint)):.1f} degrees: the "
-            "laser should be level, so that it sees walls and not the floor.",
-        )
-        for joint in messages.transforms
-        if joint.child in {head.frame for head in messages.scan_headers} and _tilt(joint) > _TILT
-    ]
+def _check_tilt(messages: MessageStatistics) -> Iterator[Finding]:
+    scan_frames = {header.frame for header in messages.scan_headers}
+    for transform in messages.transforms:
+        tilt = math.acos(min(1.0, abs(float(transform.first_transform[2, 2]))))
+        if transform.child in scan_frames and tilt > _MAX_TILT:
+            text = (
+                f"The transform {transform.parent} -> {transform.child} is tilted by {math.degrees(tilt):.1f} degrees: "
+                "the laser should be level, so that it sees walls and not the floor."
+            )
+            yield Finding("doubtful", "tilted", text)
 
 
-def _tilt(joint: FrameTransform) -> float:
-    """Of the child's z axis against the parent's, upright or upside down, rad."""
-    return math.acos(min(1.0, abs(float(joint.first_transform[2, 2]))))
-
-
-def _check_map_to_odom(messages: MessageStatistics) -> list[Finding]:
-    """The transform that rtl will publish is there already."""
+def _check_map_to_odom(messages: MessageStatistics) -> Iterator[Finding]:
+    """A finding where another program publishes the transform that rtl publishes."""
     odom, _ = messages.odometry_frames
-    others = [joint for joint in messages.transforms if joint.child == odom]
-    return [
-        Finding(
-            "doubtful",
-            "map -> odom",
-            f"There are transforms {joint.parent} -> {joint.child} of another SLAM or localization: stop it, or leave "
-            "them away when the bag is played for the nodes, since rtl publishes the same.",
+    transform = next((transform for transform in messages.transforms if transform.child == odom), None)
+    if transform is not None:
+        text = (
+            f"There are transforms {transform.parent} -> {transform.child} of another SLAM or localization: stop it, "
+            "or leave them away when the bag is played for the nodes, since rtl publishes the same."
         )
-        for joint in others[:1]
-    ]
+        yield Finding("doubtful", "map -> odom", text)

@@ -1,8 +1,8 @@
-"""A running system: who publishes what and is heard by whom, which of our nodes run, and what they say."""
+"""Checks on a running system: its nodes, publishers, subscriptions and clocks."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,28 +10,31 @@ from hmt_slam_ros.doctor.finding import Finding, Severity, times_text
 from hmt_slam_ros.process_table import COORDINATOR, process_names, topic_of
 
 OUR_NODES = process_names()
+"""Nodes without which there is no mapping."""
+
 SCAN, ODOM, TF, TF_STATIC, CLOCK = "scan", "odom", "tf", "tf_static", "/clock"
 ESTIMATES = topic_of("LocalEstimate")
 SINGLE_PUBLISHER_TOPICS = (SCAN, ODOM, "map", "pose", CLOCK)
 """Topics that have one publisher."""
 
-# By the state of a node that takes no part, what makes it do so.
 _STATE_REMEDIES = {
     "unconfigured": "ros2 lifecycle set {first} configure and then activate{others}, or start with autostart:=true",
     "inactive": "ros2 lifecycle set {first} activate{others}, or start with autostart:=true",
     "finalized": "end {first} and start it again{others}, since no transition leads out of that",
 }
 
-# Stamps that differ by this from the computer's clock, s: doubtful, and wrong.
+"""{lifecycle state: how to activate the nodes in it}."""
+
 _CLOCK_OFFSETS = (0.5, 10.0)
+"""Offset of stamps from the computer's clock: doubtful, and wrong, s."""
 
 
 class Mismatch(NamedTuple):
-    """A publisher that a subscriber does not hear.
+    """A publisher and a subscription with incompatible QoS.
 
-    :ivar publisher: node.
-    :ivar subscriber: node.
-    :ivar reason: in DDS's words.
+    :ivar publisher: name of the node.
+    :ivar subscriber: name of the node.
+    :ivar reason: the sentence of DDS.
     """
 
     publisher: str
@@ -41,11 +44,11 @@ class Mismatch(NamedTuple):
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic as the graph of the system shows it.
+    """A topic in the ROS graph.
 
-    :ivar message_count: messages that came while the doctor listened, None where it did not.
-    :ivar publishers: nodes, once for each publisher.
-    :ivar mismatches: pairs that do not hear each other.
+    :ivar message_count: number of messages received, None without a subscription.
+    :ivar publishers: names of nodes, one for each publisher.
+    :ivar mismatches: pairs with incompatible QoS.
     """
 
     message_count: int | None
@@ -54,12 +57,12 @@ class Topic:
 
 
 class NodeStatus(NamedTuple):
-    """What a node said on /diagnostics last.
+    """The last diagnostics of a node.
 
-    :ivar name: of the node, with its namespace.
-    :ivar level: 0 all is well, 1 warning, 2 and more error.
+    :ivar name: name of the node, with its namespace.
+    :ivar level: 0 OK, 1 warning, 2 and more error.
     :ivar message: a sentence.
-    :ivar state: of a managed node, such as inactive; else empty.
+    :ivar state: lifecycle state of a managed node, else empty.
     """
 
     name: str
@@ -70,17 +73,17 @@ class NodeStatus(NamedTuple):
 
 @dataclass(frozen=True)
 class RunningSystem:
-    """What was seen of a running system.
+    """Observations of a running system.
 
-    :ivar seconds: how long it was listened to.
-    :ivar topics: by name, without namespace; /clock has none.
+    :ivar seconds: duration of the observation, s.
+    :ivar topics: {name without namespace: topic}.
     :ivar nodes: names of all nodes but the doctor's.
-    :ivar sim_time_nodes: nodes with use_sim_time.
-    :ivar diagnostics: by node.
-    :ivar clock_offsets: by topic, by how much its stamps are before the computer's clock as they arrive, s (median);
-        empty where a /clock runs.
-    :ivar conflicting_transforms: transforms that two sources tell in turn, with how often.
-    :ivar missing_laser_transform: what of the laser's transform is missing, empty where nothing is.
+    :ivar sim_time_nodes: names of the nodes with use_sim_time.
+    :ivar diagnostics: last diagnostics of each node.
+    :ivar clock_offsets: {topic: median by which its stamps precede the computer's clock on arrival, s}; empty where
+        /clock is published.
+    :ivar conflicting_transforms: {transform: number of stamps for which two sources published different values}.
+    :ivar missing_laser_transform: sentence about a missing transform of the laser, empty where none is missing.
     """
 
     seconds: float
@@ -93,74 +96,75 @@ class RunningSystem:
     missing_laser_transform: str
 
 
-def findings(running: RunningSystem) -> list[Finding]:
-    """All of it."""
-    return [
-        *_check_nodes(running),
-        *_check_states(running),
-        *_check_silence(running),
-        *_check_qos(running),
-        *_check_publishers(running),
-        *_check_clock(running),
-        *_check_diagnostics(running),
-    ]
+def running_findings(running: RunningSystem) -> Iterator[Finding]:
+    """Findings on nodes, topics, publishers and clocks."""
+    states = list(_check_states(running))
+    yield from _check_nodes(running, all_active=not states)
+    yield from states
+    yield from _check_silence(running, all_active=not states)
+    yield from _check_qos(running)
+    yield from _check_publishers(running)
+    yield from _check_clock(running)
+    yield from _check_diagnostics(running)
 
 
-def _check_nodes(running: RunningSystem) -> list[Finding]:
-    there = [name for name in OUR_NODES if name in running.nodes]
-    if not there:
+def _check_nodes(running: RunningSystem, *, all_active: bool) -> Iterator[Finding]:
+    present = [name for name in OUR_NODES if name in running.nodes]
+    missing = [name for name in OUR_NODES if name not in present]
+    if not present:
         text = "None of the nodes of hmt_slam_ros runs, so that sensors alone were looked at."
-        return [Finding("fine", "nodes", text)]
-    missing = [name for name in OUR_NODES if name not in there]
-    if missing:
+        yield Finding("fine", "nodes", text)
+    elif missing:
         verb = "is" if len(missing) == 1 else "are"
-        text = f"Of the nodes, {_join_names(missing)} {verb} missing: start all of them, such "
-        return [Finding("wrong", "nodes", text + "as by mapping.launch.py; the others wait for them.")]
-    return [] if _check_states(running) else [Finding("fine", "nodes", f"All nodes run: {_join_names(there)}.")]
+        text = (
+            f"Of the nodes, {_join_names(missing)} {verb} missing: start all of them, such as by mapping.launch.py; "
+            "the others wait for them."
+        )
+        yield Finding("wrong", "nodes", text)
+    elif all_active:
+        yield Finding("fine", "nodes", f"All nodes run: {_join_names(present)}.")
 
 
-def _check_states(running: RunningSystem) -> list[Finding]:
-    """Nodes that run and take no part, by their states."""
-    found = []
+def _check_states(running: RunningSystem) -> Iterator[Finding]:
+    """Findings on nodes that run but are not active."""
     for state, remedy in _STATE_REMEDIES.items():
         names = _nodes_in_state(running, state)
         if names:
             others = f", and likewise {_join_names(names[1:])}" if len(names) > 1 else ""
             verbs = f"is {state} and takes" if len(names) == 1 else f"are {state} and take"
             text = f"{_join_names(names)} {verbs} no part: {remedy.format(first=names[0], others=others)}."
-            found.append(Finding("wrong", "states", text))
-    return found
+            yield Finding("wrong", "states", text)
 
 
 def _nodes_in_state(running: RunningSystem, state: str) -> list[str]:
-    """Our nodes that said that they are in it, with their namespaces."""
+    """Names of our nodes in a lifecycle state, with their namespaces."""
     return sorted(
-        told.name for told in running.diagnostics if told.state == state and told.name.rpartition("/")[2] in OUR_NODES
+        status.name
+        for status in running.diagnostics
+        if status.state == state and status.name.rpartition("/")[2] in OUR_NODES
     )
 
 
-def _check_silence(running: RunningSystem) -> list[Finding]:
-    found = []
+def _check_silence(running: RunningSystem, *, all_active: bool) -> Iterator[Finding]:
     for name in (SCAN, ODOM):
         topic = running.topics[name]
         by_transform = name == ODOM and running.topics[TF].message_count
         if not topic.message_count and not by_transform:
-            found.append(Finding("wrong", f"{name} silent", _silence_text(name, topic, running.seconds)))
+            yield Finding("wrong", f"{name} silent", _silence_text(name, topic, running.seconds))
     if running.missing_laser_transform:
-        found.append(Finding("wrong", "laser transform", running.missing_laser_transform))
+        yield Finding("wrong", "laser transform", running.missing_laser_transform)
     estimates = running.topics[ESTIMATES]
     if (
         COORDINATOR in running.nodes
         and running.topics[SCAN].message_count
         and not estimates.message_count
-        and not _check_states(running)
+        and all_active
     ):
         text = (
             f"Scans come, and slam said nothing about one for {running.seconds:g} s: it is paused, or "
             "waits for odometry, a transform or the other nodes; its own log and /diagnostics say for which."
         )
-        found.append(Finding("doubtful", "slam silent", text))
-    return found
+        yield Finding("doubtful", "slam silent", text)
 
 
 def _silence_text(name: str, topic: Topic, seconds: float) -> str:
@@ -175,69 +179,58 @@ def _silence_text(name: str, topic: Topic, seconds: float) -> str:
     )
 
 
-def _check_qos(running: RunningSystem) -> list[Finding]:
-    return [
-        Finding(
-            "wrong",
-            "QoS mismatch",
-            f"{pair.subscriber} does not hear {name} of {pair.publisher}: {pair.reason}; let both be reliable, or the "
-            "subscriber best effort, and alike for durability.",
+def _check_qos(running: RunningSystem) -> Iterator[Finding]:
+    for name, topic in running.topics.items():
+        for pair in topic.mismatches:
+            text = (
+                f"{pair.subscriber} does not hear {name} of {pair.publisher}: {pair.reason}; let both be reliable, or "
+                "the subscriber best effort, and alike for durability."
+            )
+            yield Finding("wrong", "QoS mismatch", text)
+
+
+def _check_publishers(running: RunningSystem) -> Iterator[Finding]:
+    for name in SINGLE_PUBLISHER_TOPICS:
+        topic = running.topics.get(name)
+        if topic is not None and len(topic.publishers) > 1:
+            text = (
+                f"{name} has {len(topic.publishers)} publishers, {_join_names(topic.publishers)}: stop all but one of "
+                "them, or remap the others."
+            )
+            yield Finding("wrong", "two publishers", text)
+    for transform, count in running.conflicting_transforms.items():
+        text = (
+            f"The transform {transform} was told differently for one stamp {times_text(count)}: two nodes publish it, "
+            f"of {_join_names(running.topics[TF].publishers)}; stop one of them (or its publish_tf)."
         )
-        for name, topic in running.topics.items()
-        for pair in topic.mismatches
-    ]
+        yield Finding("wrong", "two transforms", text)
 
 
-def _check_publishers(running: RunningSystem) -> list[Finding]:
-    found = [
-        Finding(
-            "wrong",
-            "two publishers",
-            f"{name} has {len(topic.publishers)} publishers, {_join_names(topic.publishers)}: stop all but one of "
-            "them, or remap the others.",
-        )
-        for name in SINGLE_PUBLISHER_TOPICS
-        if (topic := running.topics.get(name)) is not None and len(topic.publishers) > 1
-    ]
-    return found + [
-        Finding(
-            "wrong",
-            "two transforms",
-            f"The transform {joint} was told differently for one stamp {times_text(count)}: two nodes publish it, of "
-            f"{_join_names(running.topics[TF].publishers)}; stop one of them (or its publish_tf).",
-        )
-        for joint, count in running.conflicting_transforms.items()
-    ]
-
-
-def _check_clock(running: RunningSystem) -> list[Finding]:
+def _check_clock(running: RunningSystem) -> Iterator[Finding]:
     clock = running.topics[CLOCK].publishers
-    found = []
     if running.sim_time_nodes and not clock:
         text = (
             f"{_join_names(running.sim_time_nodes)} {'has' if len(running.sim_time_nodes) == 1 else 'have'} "
             "use_sim_time, and nobody publishes /clock, so that time stands still: start the simulation or ros2 bag "
             "play --clock, or set use_sim_time to false."
         )
-        found.append(Finding("wrong", "use_sim_time", text))
-    for name, away in running.clock_offsets.items():
-        severity: Severity = "wrong" if abs(away) >= _CLOCK_OFFSETS[1] else "doubtful"
-        if abs(away) >= _CLOCK_OFFSETS[0]:
+        yield Finding("wrong", "use_sim_time", text)
+    for name, offset in running.clock_offsets.items():
+        severity: Severity = "wrong" if abs(offset) >= _CLOCK_OFFSETS[1] else "doubtful"
+        if abs(offset) >= _CLOCK_OFFSETS[0]:
             text = (
-                f"The stamps of {name} are {abs(away):.2f} s {'before' if away > 0.0 else 'after'} the clock of this "
-                "computer when they arrive: synchronize the clocks of both computers (chrony), or, where a bag is "
+                f"The stamps of {name} are {abs(offset):.2f} s {'before' if offset > 0.0 else 'after'} the clock of "
+                "this computer when they arrive: synchronize the clocks of both computers (chrony), or, where a bag is "
                 "played, use ros2 bag play --clock and use_sim_time."
             )
-            found.append(Finding(severity, "stamps against clock", text))
-    return found
+            yield Finding(severity, "stamps against clock", text)
 
 
-def _check_diagnostics(running: RunningSystem) -> list[Finding]:
-    return [
-        Finding("wrong" if told.level > 1 else "doubtful", "diagnostics", f"{told.name} says: {told.message}")
-        for told in running.diagnostics
-        if told.level
-    ]
+def _check_diagnostics(running: RunningSystem) -> Iterator[Finding]:
+    for status in running.diagnostics:
+        if status.level:
+            severity: Severity = "wrong" if status.level > 1 else "doubtful"
+            yield Finding(severity, "diagnostics", f"{status.name} says: {status.message}")
 
 
 def _join_names(names: tuple[str, ...] | list[str]) -> str:

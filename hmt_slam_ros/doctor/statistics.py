@@ -1,42 +1,63 @@
-"""What is gathered from a log or from running topics, as arrays, before anything is judged."""
+"""Statistics of a log or of running topics, gathered in one pass, before any check.
+
+The robot's motion comes from the scans alone, so that odometry can be compared with it. A search over shifts of the
+beams gives the turn between two scans, and point-to-line registration refines the motion.
+"""
 
 from __future__ import annotations
 
-import struct
-from collections import Counter
-from dataclasses import dataclass, field
-from pathlib import Path
+import math
+from array import array
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from rosbags.rosbag2 import Reader
+from numba import njit
 
-from hmt_slam_ros.arrays import Bool, Float64, Int64
-from hmt_slam_ros.logs.bag import (
-    DEFAULT_ODOM_TOPIC,
-    DEFAULT_SCAN_TOPIC,
-    choose_odom_topic,
-    choose_scan_topic,
-    read_header,
-    read_messages,
-    read_topics,
-)
-from hmt_slam_ros.logs.mounting import frame_name, transform_from_quaternion
-from hmt_slam_ros.logs.ros_types import ODOMETRY, TRANSFORMS, RosMessage, deserialize
+from hmt_slam_ros.arrays import Bool, Float32, Float64, Int64
+from hmt_slam_ros.configuration.topology import RefinementParameters
+from hmt_slam_ros.doctor.frames import MessageStatistics
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.logs import Log
+from hmt_slam_ros.logs.records import LogRecord
+from hmt_slam_ros.registration.scan_to_scan import Weighting, extract_surfaces, normal_equations
+from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.scan import SweepCheck
 
-_NANOSECOND = 1e-9
+_MIN_INTERVAL = 0.15
+"""Least time between two scans that are registered, s: over less, a robot moves no farther than the match errs."""
+
+_BATCH = 256
+"""Pairs of scans that are registered together."""
+
+_MAX_RANGE, _MAX_POINTS = 30.0, 180
+"""Largest range, m, and number of points of a scan that are used."""
+
+_MIN_POINTS = 40
+"""Least number of points of a match."""
+
+_MAX_TURN, _TURN_STEP, _MAX_BEAMS = math.radians(80.0), math.radians(1.0), 180
+"""Turns that are searched, to each side, rad, the step between them, rad, and the number of beams compared."""
+
+_MIN_OVERLAP, _MAX_DIFFERENCE = 0.4, 1.0
+"""Least share of the beams that both scans have, and the limit of a difference of ranges, m."""
+
+_GATES = (1.5, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3, 0.3, 0.2, 0.2)
+"""Largest distance of points that correspond, in each iteration, m."""
+
+_WEAK_PRIOR = np.diag([1.0, 1.0, math.radians(30.0) ** -2])
+"""Information of the prior on a motion, for directions that the scans do not show: 1 m, 1 m and 30 degrees."""
 
 
 class BeamCounts(NamedTuple):
-    """How many beams of a scan are what; shape (n,) each, over n scans.
+    """Numbers of beams by kind in each of n scans, shape (n,) each.
 
-    :ivar beams: all of them.
-    :ivar returns: with a return.
-    :ivar nan: not a number.
-    :ivar infinite: inf of either sign.
-    :ivar near: finite, and below the least range.
-    :ivar far: finite, and at or beyond the largest range.
+    :ivar beams: all beams.
+    :ivar returns: beams with a valid range.
+    :ivar nan: NaN.
+    :ivar infinite: infinite, of either sign.
+    :ivar near: finite, below the least range.
+    :ivar far: finite, at or beyond the largest range.
     """
 
     beams: Int64
@@ -48,11 +69,11 @@ class BeamCounts(NamedTuple):
 
 
 class BeamStatistics(NamedTuple):
-    """What each of the b beams of a laser saw, over the scans that have as many beams as the first.
+    """Ranges of each of the b beams, over the scans that have as many beams as the first.
 
-    :ivar returns: shape (b,), with how many returns.
-    :ivar nearest: shape (b,), the nearest of them, m.
-    :ivar farthest: shape (b,), the farthest of them, m.
+    :ivar returns: shape (b,), number of valid ranges.
+    :ivar nearest: shape (b,), the smallest of them, m.
+    :ivar farthest: shape (b,), the largest of them, m.
     """
 
     returns: Int64
@@ -62,16 +83,16 @@ class BeamStatistics(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScanStatistics:
-    """All scans.
+    """Statistics of n scans.
 
     :ivar source_stamps: shape (n,), the source's own stamps, ns, in the order of arrival.
     :ivar stamps: shape (n,), on the running clock of `LogRecord`, ns.
     :ivar geometry: shape (n, 5): first angle, increment, rad; least and largest range, m; time from beam to beam, s.
     :ivar laser_poses: shape (n, 3), ``base_T_laser``, m and rad.
-    :ivar counts: of beams.
-    :ivar beam_statistics: of the laser.
-    :ivar sweep_fault_count: scans whose time from beam to beam cannot be.
-    :ivar first_sweep_fault: what is said of the first of them.
+    :ivar counts: beams by kind.
+    :ivar beam_statistics: ranges by beam.
+    :ivar sweep_fault_count: number of scans with an impossible ``time_increment``.
+    :ivar first_sweep_fault: sentence about the first of them.
     """
 
     source_stamps: Int64
@@ -86,12 +107,12 @@ class ScanStatistics:
 
 @dataclass(frozen=True, eq=False)
 class OdometryStatistics:
-    """All odometry readings.
+    """Statistics of m odometry readings.
 
     :ivar source_stamps: shape (m,), the source's own stamps, ns, in the order of arrival.
     :ivar stamps: shape (m,), on the running clock, ns.
     :ivar poses: shape (m, 3), ``odom_T_base``, m and rad, finite.
-    :ivar non_finite_count: readings that were left out since they are not.
+    :ivar non_finite_count: number of readings that are NaN or infinite, which are left out.
     """
 
     source_stamps: Int64
@@ -105,9 +126,9 @@ class OdometryStatistics:
         return float(np.hypot(*np.diff(self.poses[:, :2], axis=0).T).sum()) if len(self.poses) else 0.0
 
     def poses_at(self, stamps: Float64) -> Float64:
-        """Poses (k, 3) at any stamps (k,), ns: between two readings in proportion, before and after all as those.
+        """Interpolated poses, shape (k, 3), with unwrapped headings; constant before the first and after the last.
 
-        Headings are unwrapped.
+        :param stamps: shape (k,), ns.
         """
         times = (self.stamps - self.stamps[0]).astype(np.float64)
         wanted = stamps - float(self.stamps[0])
@@ -117,13 +138,13 @@ class OdometryStatistics:
 
 @dataclass(frozen=True, eq=False)
 class ScanMotions:
-    """The robot's motion from scan to scan as the scans alone have it.
+    """The robot's motion between pairs of scans, from the scans alone.
 
-    :ivar starts: shape (p,), stamps, ns.
-    :ivar ends: shape (p,), likewise.
+    :ivar starts: shape (p,), stamps of the first scans, ns.
+    :ivar ends: shape (p,), stamps of the second scans, ns.
     :ivar motions: shape (p, 3), ``start_T_end``, m and rad.
-    :ivar information: shape (p, 3, 3), of the motion in the frame of its end; small where scans show nothing.
-    :ivar matched: shape (p,), share of the points of one scan that meet a wall of the other.
+    :ivar information: shape (p, 3, 3), information matrix of the motion in the frame of its end.
+    :ivar matched: shape (p,), share of the points of one scan that match a wall of the other.
     """
 
     starts: Int64
@@ -133,158 +154,237 @@ class ScanMotions:
     matched: Float64
 
     def select(self, chosen: Bool | Int64) -> ScanMotions:
-        """Some of them."""
-        return ScanMotions(
-            self.starts[chosen], self.ends[chosen], self.motions[chosen], self.information[chosen], self.matched[chosen]
-        )
-
-
-class FrameTransform(NamedTuple):
-    """A transform as it was heard.
-
-    :ivar parent: frame.
-    :ivar child: frame.
-    :ivar topic: on which.
-    :ivar first_transform: shape (4, 4), ``parent_T_child`` of the first message, m.
-    :ivar message_count: how many.
-    :ivar max_change: largest distance of any from the first, m, or m of a point at 1 m for a rotation.
-    """
-
-    parent: str
-    child: str
-    topic: str
-    first_transform: NDArray[np.float64]
-    message_count: int
-    max_change: float
-
-
-class ScanHeader(NamedTuple):
-    """What a LaserScan message says of itself and `Scan` does not keep.
-
-    :ivar frame: its frame.
-    :ivar angle_min: rad.
-    :ivar angle_max: rad.
-    :ivar angle_increment: rad.
-    :ivar beams: how many.
-    """
-
-    frame: str
-    angle_min: float
-    angle_max: float
-    angle_increment: float
-    beams: int
-
-
-@dataclass(frozen=True, eq=False)
-class MessageStatistics:
-    """What only messages tell, as opposed to a log of another format.
-
-    :ivar counts: messages by topic.
-    :ivar types: of the topics.
-    :ivar scan_headers: scans that differ in what they say of themselves, each once, with how many there are.
-    :ivar odometry_frames: (frame, child frame) of the odometry; the transform's where there is no topic of it.
-    :ivar transforms: all transforms.
-    """
-
-    counts: dict[str, int]
-    types: dict[str, str]
-    scan_headers: dict[ScanHeader, int]
-    odometry_frames: tuple[str, str]
-    transforms: tuple[FrameTransform, ...]
+        """The motions that a mask or an index array selects."""
+        return ScanMotions(*(getattr(self, column.name)[chosen] for column in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """All that was gathered.
+    """All statistics of a log.
 
-    :ivar name: of the log.
-    :ivar scans: all of them.
-    :ivar odometry: all readings.
-    :ivar motions: from scan to scan.
-    :ivar messages: where there are some.
+    :ivar name: name of the log.
+    :ivar scans: statistics of the scans.
+    :ivar odometry: statistics of the odometry.
+    :ivar motions: motions between scans.
+    :ivar messages: statistics of the messages, None where the log is no bag.
     """
 
     name: str
     scans: ScanStatistics
     odometry: OdometryStatistics
     motions: ScanMotions
-    messages: MessageStatistics | None = field(default=None)
+    messages: MessageStatistics | None = None
 
     @property
     def duration(self) -> float:
-        """From the first to the last stamp on the running clock, s."""
+        """Time from the first to the last stamp on the running clock, s."""
         stamps = np.concatenate((self.scans.stamps, self.odometry.stamps))
-        return float(stamps.max() - stamps.min()) * _NANOSECOND if stamps.size else 0.0
+        return float(stamps.max() - stamps.min()) * 1e-9 if stamps.size else 0.0
 
 
 def seconds_between(stamps: Int64) -> Float64:
-    """From each stamp to the next, s, shape (n - 1,)."""
-    return np.diff(stamps) * _NANOSECOND
+    """Times between consecutive stamps, s, shape (n - 1,)."""
+    return np.diff(stamps) * 1e-9
 
 
-class TransformCollector:
-    """Collects transforms."""
+class _Pair(NamedTuple):
+    start: Scan
+    end: Scan
+    guess: float
+
+
+class ScanMotionFinder:
+    """Registers scans, which are added one after the other, with the scans before them."""
 
     def __init__(self) -> None:
-        self._first_transforms: dict[tuple[str, str, str], NDArray[np.float64]] = {}
-        self._message_counts: Counter[tuple[str, str, str]] = Counter()
-        self._max_changes: dict[tuple[str, str, str], float] = {}
+        self._last: Scan | None = None
+        self._pairs: list[_Pair] = []
+        self._motions: list[ScanMotions] = []
 
-    @property
-    def transforms(self) -> tuple[FrameTransform, ...]:
-        """All of them."""
-        return tuple(
-            FrameTransform(*key[:2], key[2], first, self._message_counts[key], self._max_changes[key])
-            for key, first in self._first_transforms.items()
+    def add(self, scan: Scan) -> None:
+        """Pair a scan with the last one that is old enough, and register full batches."""
+        last = self._last
+        if last is not None and 0 < scan.stamp - last.stamp < _MIN_INTERVAL * 1e9:
+            return
+        self._last = scan
+        if last is None:
+            return
+        self._pairs.append(_Pair(last, scan, turn_between(last, scan)))
+        if len(self._pairs) == _BATCH:
+            self._register()
+
+    def finish(self) -> ScanMotions:
+        """Register the last batch and return all motions."""
+        self._register()
+        stamps, values = np.zeros(0, np.int64), np.zeros(0)
+        parts = [ScanMotions(stamps, stamps, values.reshape(0, 3), values.reshape(0, 3, 3), values), *self._motions]
+        return ScanMotions(
+            *(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(ScanMotions))
         )
 
-    def add(self, topic: str, message: RosMessage) -> None:
-        """Take in a tf2_msgs/TFMessage."""
-        for joint in message.transforms:
-            key = (frame_name(joint.header.frame_id), frame_name(joint.child_frame_id), topic)
-            move, turn = joint.transform.translation, joint.transform.rotation
-            transform = transform_from_quaternion((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w))
-            first = self._first_transforms.setdefault(key, transform)
-            self._message_counts[key] += 1
-            self._max_changes[key] = max(self._max_changes.get(key, 0.0), float(np.abs(transform - first).max()))
+    def _register(self) -> None:
+        pairs, self._pairs = self._pairs, []
+        if not pairs:
+            return
+        scans = [pairs[0].start, *(pair.end for pair in pairs)]
+        surfaces = extract_surfaces(scans, _MAX_RANGE, _MAX_POINTS)
+        starts, ends = np.arange(len(pairs)), np.arange(1, len(pairs) + 1)
+        options = RefinementParameters()
+        guess = np.zeros((len(pairs), 3))
+        guess[:, 2] = [pair.guess for pair in pairs]
+        motions = guess
+        for gate in _GATES:
+            weights = Weighting(options.sigma, max(options.robust_scale, 0.3 * gate), 1.0)
+            information, gradient, matched = normal_equations(
+                surfaces, ends, surfaces, starts, motions, gate, weights, 1
+            )
+            slope = gradient + se2.log(se2.between(guess, motions)) @ _WEAK_PRIOR
+            step = np.linalg.solve(information + _WEAK_PRIOR, slope[..., None])[..., 0]
+            motions = se2.compose(motions, se2.exp(-np.clip(step, -1.0, 1.0)))
+        matched[np.diff(surfaces.starts)[1:] < _MIN_POINTS] = 0.0
+        stamps = np.array([scan.stamp for scan in scans])
+        self._motions.append(ScanMotions(stamps[:-1], stamps[1:], motions, information, matched))
 
 
-def read_message_statistics(path: Path) -> MessageStatistics:
-    """Read a bag that `open_log` took."""
-    types = read_topics(path)
-    scan_topic = choose_scan_topic(types, DEFAULT_SCAN_TOPIC, path.name)
-    odom_topic = choose_odom_topic(types, DEFAULT_ODOM_TOPIC, path.name)
-    heads = Counter(read_scan_header(message.content) for message in read_messages(path, {scan_topic}))
-    joints = TransformCollector()
-    for topic in ("/tf_static", "/tf"):
-        for message in read_messages(path, {topic}):
-            if message.kind == TRANSFORMS:
-                joints.add(topic, deserialize(message.content, TRANSFORMS))
-    return MessageStatistics(
-        _message_counts(path), types, dict(heads), _odometry_frames(path, odom_topic, joints), joints.transforms
-    )
+def turn_between(start: Scan, end: Scan) -> float:
+    """The robot's turn between two scans, rad, to about a degree; 0 where their beams differ."""
+    if start.ranges.size != end.ranges.size or start.angle_increment != end.angle_increment or not end.angle_increment:
+        return 0.0
+    size, increment = end.ranges.size, end.angle_increment
+    around = size * abs(increment) > 2.0 * math.pi - 1.5 * abs(increment)
+    shift = max(1, round(_TURN_STEP / abs(increment)))
+    steps = int(_MAX_TURN / abs(increment)) // shift
+    best = _best_shift(_capped_ranges(start), _capped_ranges(end), shift, steps, max(1, size // _MAX_BEAMS), around)
+    return best * increment + start.angle_min - end.angle_min
 
 
-def _message_counts(path: Path) -> dict[str, int]:
-    with Reader(path) as reader:
-        return {topic: info.msgcount for topic, info in reader.topics.items()}
+def _capped_ranges(scan: Scan) -> Float32:
+    """Ranges, shape (n,), m, at most ``_MAX_RANGE``, which also stands for no return."""
+    return np.where(scan.valid, np.minimum(scan.ranges, _MAX_RANGE), np.float32(_MAX_RANGE)).astype(np.float32)
 
 
-def _odometry_frames(path: Path, topic: str | None, joints: TransformCollector) -> tuple[str, str]:
-    if topic is not None:
-        for message in read_messages(path, {topic}):
-            reading = deserialize(message.content, ODOMETRY)
-            return frame_name(reading.header.frame_id), frame_name(reading.child_frame_id)
-    child = next((joint.child for joint in joints.transforms if joint.parent == "odom"), "")
-    return "odom", child
+@njit(cache=True)
+def _best_shift(start: Float32, end: Float32, shift: int, steps: int, every: int, around: bool) -> int:
+    """The shift, in beams, of the ranges (n,) of the start against those of the end with the least difference."""
+    best, least, size = 0, np.inf, end.size
+    for k in range(-steps, steps + 1):
+        total, seen = 0.0, 0
+        for i in range(0, size, every):
+            j = i + k * shift
+            if around:
+                j %= size
+            elif j < 0 or j >= size:
+                continue
+            total += min(abs(start[j] - end[i]), _MAX_DIFFERENCE)
+            seen += 1
+        if seen * every >= _MIN_OVERLAP * size and total < least * seen:
+            best, least = k * shift, total / seen
+    return best
 
 
-def read_scan_header(content: bytes) -> ScanHeader:
-    """What a LaserScan (CDR) says of itself, without reading its ranges."""
-    order = "<" if content[1] & 1 else ">"
-    frame = read_header(content).frame
-    (length,) = struct.unpack_from(order + "I", content, 12)
-    # CDR aligns to four bytes, counted from behind its own header of four.
-    at = -(-(16 + length) // 4) * 4
-    first, last, increment, *_, beams = struct.unpack_from(order + "7fI", content, at)
-    return ScanHeader(frame_name(frame), first, last, increment, beams)
+class Gatherer:
+    """Gathers the statistics of records, which are added one after the other."""
+
+    def __init__(self) -> None:
+        self._scan_stamps, self._odometry_stamps = array("q"), array("q")
+        self._scan_rows, self._odometry_rows = array("d"), array("d")
+        self._counts, self._non_finite_count = array("q"), 0
+        self._beam_statistics = BeamStatistics(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
+        self._sweep_check, self._sweep_fault_count, self._first_sweep_fault = SweepCheck(), 0, ""
+        self._motions = ScanMotionFinder()
+
+    def add(self, record: LogRecord) -> None:
+        """Add a scan or an odometry reading."""
+        if isinstance(record.measurement, Scan):
+            self._add_scan(record.source_stamp, record.measurement)
+        else:
+            self._add_odometry(record.source_stamp, record.measurement)
+
+    def _add_odometry(self, source_stamp: int, reading: Odometry) -> None:
+        if not np.isfinite(reading.pose).all():
+            self._non_finite_count += 1
+            return
+        self._odometry_stamps.extend((source_stamp, reading.stamp))
+        self._odometry_rows.extend(reading.pose)
+
+    def _add_scan(self, source_stamp: int, scan: Scan) -> None:
+        if not self._scan_stamps:
+            size = scan.ranges.size
+            self._beam_statistics = BeamStatistics(np.zeros(size, np.int64), np.full(size, np.inf), np.zeros(size))
+        self._scan_stamps.extend((source_stamp, scan.stamp))
+        self._scan_rows.extend((scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max))
+        self._scan_rows.extend((scan.time_increment, *scan.laser_pose))
+        self._counts.extend(
+            _count_beams(scan.ranges, max(scan.range_min, 1e-3), scan.range_max, *self._beam_statistics)
+        )
+        scan, fault = self._sweep_check.check(scan)
+        self._sweep_fault_count += fault is not None
+        self._first_sweep_fault = self._first_sweep_fault or fault or ""
+        self._motions.add(scan)
+
+    def finish(self, name: str, messages: MessageStatistics | None = None) -> Statistics:
+        """The statistics of all records.
+
+        :param name: name of the log.
+        :param messages: statistics of its messages, None where it is no bag.
+        """
+        stamps = np.array(self._scan_stamps, np.int64).reshape(-1, 2)
+        rows = np.array(self._scan_rows, np.float64).reshape(-1, 8)
+        counts = BeamCounts(*np.array(self._counts, np.int64).reshape(-1, 6).T)
+        scans = ScanStatistics(
+            stamps[:, 0],
+            stamps[:, 1],
+            rows[:, :5],
+            rows[:, 5:],
+            counts,
+            self._beam_statistics,
+            self._sweep_fault_count,
+            self._first_sweep_fault,
+        )
+        stamps = np.array(self._odometry_stamps, np.int64).reshape(-1, 2)
+        poses = np.array(self._odometry_rows, np.float64).reshape(-1, 3)
+        odometry = OdometryStatistics(stamps[:, 0], stamps[:, 1], poses, self._non_finite_count)
+        return Statistics(name, scans, odometry, self._motions.finish(), messages)
+
+
+def gather(log: Log, messages: MessageStatistics | None = None) -> Statistics:
+    """The statistics of a log.
+
+    :param messages: statistics of its messages, None where it is no bag.
+    """
+    gatherer = Gatherer()
+    for record in log.records():
+        gatherer.add(record)
+    return gatherer.finish(log.name, messages)
+
+
+@njit(cache=True)
+def _count_beams(
+    ranges: Float32, nearest: float, farthest: float, returns: Int64, least: Float64, most: Float64
+) -> tuple[int, int, int, int, int, int]:
+    """The row of `BeamCounts` of a scan; updates the statistics of each beam where the number of beams is the same.
+
+    :param ranges: shape (n,), m.
+    :param nearest: least valid range, m.
+    :param farthest: least range that means "no return", m.
+    :param returns: shape (b,), of `BeamStatistics`, written to, as ``least`` and ``most``, shape (b,), m.
+    """
+    valid = nan = infinite = near = far = 0
+    same = ranges.size == returns.size
+    for k in range(ranges.size):
+        value = np.float64(ranges[k])
+        if np.isnan(value):
+            nan += 1
+        elif np.isinf(value):
+            infinite += 1
+        elif value < nearest:
+            near += 1
+        elif value >= farthest:
+            far += 1
+        else:
+            valid += 1
+            if same:
+                returns[k] += 1
+                least[k] = min(least[k], value)
+                most[k] = max(most[k], value)
+    return ranges.size, valid, nan, infinite, near, far

@@ -1,6 +1,6 @@
-"""Sources of scans and odometry: rosbag2, CARMEN, MRPT rawlog, and by name the simulation.
+"""Logs of scans and odometry: rosbag2, CARMEN and MRPT rawlog.
 
-What reads and writes bags loads the rosbags library; only those who do either load it.
+`bag` and `writer` load the rosbags library, so they are imported only where a bag is read or written.
 """
 
 from hmt_slam_ros.logs.records import Log, LogRecord

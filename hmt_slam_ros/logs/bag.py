@@ -29,10 +29,14 @@ from hmt_slam_ros.logs.stamps import NANOSECONDS, running_stamps
 from hmt_slam_ros.sensors import Odometry, Scan
 
 DEFAULT_SCAN_TOPIC, DEFAULT_ODOM_TOPIC = "/scan", "/odom"
+"""Topics of scans and odometry where the user names none."""
+
+_ODOM_FRAME, _BASE_FRAME = "odom", "base_link"
+"""Frame of the odometry (REP 105), and the robot's frame where the odometry has no child frame."""
 
 
 class BagMessage(NamedTuple):
-    """A message as it lies in the bag: its bag time in ns, its type, its bytes (CDR)."""
+    """A serialized message: its bag time, ns, its type, and its bytes in CDR."""
 
     bag_time: int
     kind: str
@@ -40,21 +44,21 @@ class BagMessage(NamedTuple):
 
 
 class Header(NamedTuple):
-    """A message's header: its stamp in ns and its frame."""
+    """The header of a message: its stamp, ns, and its frame."""
 
     stamp: int
     frame: str
 
 
 def read_header(content: bytes) -> Header:
-    """The header that a message begins with, without reading the rest."""
+    """The header at the beginning of a message, without deserializing the rest."""
     order = "<" if content[1] & 1 else ">"
     seconds, nanoseconds, length = struct.unpack_from(order + "iII", content, 4)
     return Header(seconds * NANOSECONDS + nanoseconds, content[16 : 15 + length].decode())
 
 
 def read_topics(path: Path) -> dict[str, str]:
-    """Message type of every topic.
+    """{topic: message type} of a bag.
 
     :raises HmtSlamError: where the bag cannot be opened.
     """
@@ -63,7 +67,7 @@ def read_topics(path: Path) -> dict[str, str]:
 
 
 def read_messages(path: Path, topics: Collection[str]) -> Iterator[BagMessage]:
-    """All messages of some topics in the order of their bag times; at one bag time, scans come last.
+    """The messages of some topics in the order of their bag times; of equal bag times, scans come last.
 
     :raises HmtSlamError: where the bag is damaged.
     """
@@ -81,7 +85,7 @@ def read_messages(path: Path, topics: Collection[str]) -> Iterator[BagMessage]:
 
 @contextmanager
 def _damage_as_error(path: Path) -> Iterator[None]:
-    """Turn whatever a reader stumbles over into one sentence."""
+    """A context that turns any exception of the rosbags library into one sentence."""
     try:
         yield
     except HmtSlamError:
@@ -95,11 +99,11 @@ def _damage_as_error(path: Path) -> Iterator[None]:
 
 
 def choose_scan_topic(topics: Mapping[str, str], wanted: str, name: str) -> str:
-    """The topic wanted; where that is the default and missing, the only one of its type.
+    """The topic of the scans: the wanted one, or the only one of its type where the default is missing.
 
-    :param topics: message type of every topic.
-    :param wanted: the topic asked for.
-    :param name: of the bag, for messages.
+    :param topics: {topic: message type}.
+    :param wanted: topic that the user wants.
+    :param name: name of the bag, for error messages.
     :raises HmtSlamError: where there is none, or more than one to choose from.
     """
     found = _choose_topic(topics, wanted, DEFAULT_SCAN_TOPIC, LASER_SCAN, name)
@@ -109,7 +113,7 @@ def choose_scan_topic(topics: Mapping[str, str], wanted: str, name: str) -> str:
 
 
 def choose_odom_topic(topics: Mapping[str, str], wanted: str, name: str) -> str | None:
-    """As `choose_scan_topic`; None where the bag has no odometry topic, but /tf to take it from.
+    """The topic of the odometry, as in `choose_scan_topic`; None where only /tf has odometry.
 
     :raises HmtSlamError: where there is neither, or more than one to choose from.
     """
@@ -131,16 +135,13 @@ def _choose_topic(topics: Mapping[str, str], wanted: str, default: str, kind: st
     return of_kind[0] if of_kind else None
 
 
-_ODOM_FRAME, _BASE_FRAME = "odom", "base_link"
-
-
 class _Measurement(NamedTuple):
-    """A scan or odometry reading that is not yet deserialized.
+    """A serialized scan or odometry reading.
 
-    :ivar bag_time: ns.
-    :ivar source_stamp: of its header, ns.
+    :ivar bag_time: bag time, ns.
+    :ivar source_stamp: stamp of its header, ns.
     :ivar scan_frame: frame of a scan, None for odometry.
-    :ivar content: bytes of the message, or the transform that stands for an odometry reading.
+    :ivar content: bytes of the message, or the transform that replaces an odometry reading.
     """
 
     bag_time: int
@@ -150,13 +151,13 @@ class _Measurement(NamedTuple):
 
 
 class BagLog:
-    """A rosbag2 whose scans stay on disk until they are asked for.
+    """A rosbag2 whose scans are read from disk when they are needed; the attributes are those of `Log`.
 
-    All of it is passed over once when the log is opened, so damage shows then. The source stamp of a record is its
-    header's; the order is that of the bag's own times, and at one bag time odometry comes before the scan.
+    Opening reads the whole bag once, which reveals damage. The source stamp of a record is that of its header. Records
+    have the order of their bag times; of equal bag times, odometry comes before the scan.
 
     :param path: a bag folder, or a .mcap or .db3 file.
-    :param window: the part wanted.
+    :param window: part of the log to read.
     :param scan_topic: topic of the scans; the only LaserScan topic where the default does not exist.
     :param odom_topic: topic of the odometry, chosen likewise; without any, the transform odom -> base on /tf.
     :raises HmtSlamError: where the bag is truncated or damaged, or lacks scans, odometry or the laser's transform.
@@ -164,6 +165,7 @@ class BagLog:
 
     def __init__(self, path: Path, window: TimeWindow, scan_topic: str, odom_topic: str) -> None:
         self._path = path
+        self.name = path.stem if path.is_file() else path.name
         topics = read_topics(path)
         self._scan_topic = choose_scan_topic(topics, scan_topic, path.name)
         self._odom_topic = choose_odom_topic(topics, odom_topic, path.name)
@@ -172,26 +174,12 @@ class BagLog:
         is_scan = [frame is not None for _, _, frame in headers]
         self._stamps = running_stamps([stamp for _, stamp, _ in headers], is_scan, _precedes_its_scan(headers))
         self._records_in_window = window.select(self._stamps)
-        self._scan_count = sum(is_scan[self._records_in_window])
-        require_scans(path.name, self._scan_count, sum(is_scan))
+        self.scan_count = sum(is_scan[self._records_in_window])
+        require_scans(path.name, self.scan_count, sum(is_scan))
+        part = self._stamps[self._records_in_window]
+        self.duration = float(part[-1] - part[0]) / NANOSECONDS
         self._true_poses = self._read_true_poses(topics)
         self._mountings = self._find_mountings(sorted({frame for _, _, frame in headers if frame is not None}))
-
-    @property
-    def name(self) -> str:
-        """Short name for reports."""
-        return self._path.stem if self._path.is_file() else self._path.name
-
-    @property
-    def scan_count(self) -> int:
-        """Number of scans."""
-        return self._scan_count
-
-    @property
-    def duration(self) -> float:
-        """Seconds from the first to the last record."""
-        part = self._stamps[self._records_in_window]
-        return float(part[-1] - part[0]) / NANOSECONDS
 
     def records(self) -> Iterator[LogRecord]:
         """All measurements in file order."""
@@ -202,7 +190,7 @@ class BagLog:
                 yield self._make_record(measurement, int(self._stamps[k]))
 
     def _read_true_poses(self, topics: Mapping[str, str]) -> dict[int, NDArray[np.float64]]:
-        """True poses (3,) by their source stamps, ns; none where the bag does not tell them."""
+        """{source stamp, ns: true pose, shape (3,)}, {} where the bag has no ground truth."""
         if topics.get(GROUND_TRUTH_TOPIC) != POSE:
             return {}
         messages = (deserialize(message.content, POSE) for message in read_messages(self._path, {GROUND_TRUTH_TOPIC}))
@@ -215,8 +203,8 @@ class BagLog:
             scan = _scan_from_message(message, stamp, self._mountings[measurement.scan_frame])
             return LogRecord(measurement.source_stamp, scan, truth)
         if self._odom_topic is None:
-            joint = measurement.content
-            pose = _pose_from_parts(joint.translation, joint.rotation)
+            transform = measurement.content
+            pose = _pose_from_parts(transform.translation, transform.rotation)
         else:
             pose = _pose_from_message(deserialize(measurement.content, ODOMETRY).pose.pose)
         return LogRecord(measurement.source_stamp, Odometry(stamp, pose), truth)
@@ -231,9 +219,10 @@ class BagLog:
                 yield _Measurement(message.bag_time, stamp, scan_frame, message.content)
 
     def _odometry_transforms(self, message: BagMessage) -> Iterator[_Measurement]:
-        for joint in deserialize(message.content, TRANSFORMS).transforms:
-            if (frame_name(joint.header.frame_id), frame_name(joint.child_frame_id)) == (_ODOM_FRAME, self._base_frame):
-                yield _Measurement(message.bag_time, _stamp(joint.header), None, joint.transform)
+        for stamped in deserialize(message.content, TRANSFORMS).transforms:
+            frames = (frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id))
+            if frames == (_ODOM_FRAME, self._base_frame):
+                yield _Measurement(message.bag_time, _stamp(stamped.header), None, stamped.transform)
 
     def _find_base_frame(self) -> str:
         """The robot's frame: the child frame of the odometry."""
@@ -244,16 +233,16 @@ class BagLog:
                 f"{self._path.name} has no message on {self._odom_topic}: record the wheel odometry in it."
             )
         for message in read_messages(self._path, {"/tf"}):
-            for joint in deserialize(message.content, TRANSFORMS).transforms:
-                if frame_name(joint.header.frame_id) == _ODOM_FRAME:
-                    return frame_name(joint.child_frame_id)
+            for stamped in deserialize(message.content, TRANSFORMS).transforms:
+                if frame_name(stamped.header.frame_id) == _ODOM_FRAME:
+                    return frame_name(stamped.child_frame_id)
         raise HmtSlamError(
             f"{self._path.name} has neither a topic of type {ODOMETRY} nor a transform from {_ODOM_FRAME!r} on /tf: "
             "record the wheel odometry in it."
         )
 
     def _find_mountings(self, frames: list[str]) -> dict[str, Mounting]:
-        """Where each scan frame is on the robot; /tf serves where /tf_static says nothing."""
+        """{scan frame: mounting}, from /tf_static, else from /tf."""
         mountings: dict[str, Mounting] = {}
         tree = FrameTree()
         for topic in ("/tf_static", "/tf"):
@@ -280,7 +269,7 @@ class BagLog:
 
 
 def _stamp(header: RosMessage) -> int:
-    """Of a header, ns."""
+    """The stamp of a header, ns."""
     return int(header.stamp.sec * NANOSECONDS + header.stamp.nanosec)
 
 
@@ -289,12 +278,13 @@ def _pose_from_message(pose: RosMessage) -> NDArray[np.float64]:
     return _pose_from_parts(pose.position, pose.orientation)
 
 
-def _pose_from_parts(place: RosMessage, turn: RosMessage) -> NDArray[np.float64]:
-    return np.array([place.x, place.y, heading_from_quaternion((turn.x, turn.y, turn.z, turn.w))])
+def _pose_from_parts(position: RosMessage, rotation: RosMessage) -> NDArray[np.float64]:
+    heading = heading_from_quaternion((rotation.x, rotation.y, rotation.z, rotation.w))
+    return np.array([position.x, position.y, heading])
 
 
 def _precedes_its_scan(headers: list[tuple[int, int, str | None]]) -> list[bool]:
-    """For each measurement, whether it is odometry with the bag time and stamp of a scan right behind it."""
+    """Whether each measurement is odometry directly before a scan with the same bag time and stamp."""
     pairs = [a[2] is None and b[2] is not None and a[:2] == b[:2] for a, b in pairwise(headers)]
     return [*pairs, False][: len(headers)]
 

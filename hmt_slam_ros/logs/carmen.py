@@ -1,4 +1,4 @@
-"""CARMEN logs: FLASER, ROBOTLASER1 and ODOM lines; all others carry no measurement that is used here."""
+"""CARMEN logs: their FLASER, ROBOTLASER1 and ODOM lines."""
 
 from __future__ import annotations
 
@@ -18,30 +18,34 @@ from hmt_slam_ros.logs.records import InMemoryLog, LogEntry, TimeWindow
 from hmt_slam_ros.logs.stamps import stamp_from_seconds
 from hmt_slam_ros.sensors import Odometry, Scan
 
-_FEWEST_REPEATS = 3
-_BAND = 0.01  # a sensor's codes for "no return" lie within one percent: 51.09 ... 51.16 m, 81.83 ... 81.91 m
-_BANDS_BELOW = 5
+_MIN_REPEATS = 3
+"""Least number of equal readings at the maximum of the sensor."""
+
+_BAND, _BANDS_BELOW = 0.01, 5
+"""Width of the band of codes for "no return", as a share of the maximum, and the number of bands below it.
+
+Sensors use 51.09 to 51.16 m, or 81.83 to 81.91 m.
+"""
+
 _CROWD_RATIO = 10.0
+"""Least ratio of readings in the band of the maximum to those in a band below, for codes of "no return"."""
 
 
 def no_return_threshold(ranges: NDArray[np.float32]) -> float:
-    """The smallest range that means "no return" in a log that does not say so, meters.
+    """The smallest range that means "no return" in a log that states none, m.
 
-    A sensor reports its maximum, or a few values close to it, for every beam that meets nothing. Real distances
-    spread out as the robot moves, so the maximum stands out as a crowd at the far end. The rule: M is the largest
-    reading that occurs three times (a stray larger one is no maximum). The readings at or beyond 0.99 M mean "no
-    return" if there are more than ten times as many of them as there are, on average, in each of the five bands of
-    the same width below - and if they are not the whole log. Real returns in the last percent of the reach of such
-    a sensor are lost with them.
+    A sensor reports its maximum, or a few values close to it, for every beam without a return. Real distances spread as
+    the robot moves, so these readings are a crowd at the far end. The maximum M is the largest reading that occurs
+    three times. Readings from 0.99 M on mean "no return" if they are more than ten times as many as in each of the five
+    bands of that width below, on average, and not the whole log. Real returns in the last percent are lost with them.
 
-    :param ranges: shape (n,), meters, all readings of the log.
-    :returns: the smallest reading of that crowd; where there is none, just beyond the largest reading (inf for no
-        finite reading at all).
+    :param ranges: shape (n,), all readings of the log, m.
+    :returns: the smallest reading of that crowd; without one, just beyond the largest reading (inf without readings).
     """
     values, counts = np.unique(ranges[np.isfinite(ranges) & (ranges > 0.0)], return_counts=True)
     if not values.size:
         return float("inf")
-    repeated = np.flatnonzero(counts >= _FEWEST_REPEATS)
+    repeated = np.flatnonzero(counts >= _MIN_REPEATS)
     if repeated.size:
         maximum = float(values[repeated[-1]])
         edges = maximum * (1.0 - _BAND * np.array([1 + _BANDS_BELOW, 1]))
@@ -54,24 +58,35 @@ def no_return_threshold(ranges: NDArray[np.float32]) -> float:
 
 
 _KNOWN_LINE = re.compile(rb"^(# message_name|(PARAM|SYNC|ODOM|FLASER|RLASER|ROBOTLASER\d|RAWLASER\d|TRUEPOS) )", re.M)
+"""Beginning of a line that CARMEN writes."""
+
 _FRONT_LASER_OFFSET = b"robot_frontlaser_offset"
-_TRAILER = 3  # ipc_timestamp ipc_hostname logger_timestamp
-_FEWEST_SCANS_FOR_OFFSET = 10
-_LARGEST_OFFSET = 2.0  # m; farther from its odometry, a pose is a corrected one and not the laser's
-_SAME_OFFSET = 2e-3  # m and rad; the poses are written with six decimals
+"""Parameter with the laser's distance ahead of the robot's middle, m."""
+
+_TRAILER = 3
+"""Fields at the end of each line: ipc_timestamp, ipc_hostname, logger_timestamp."""
+
+_MIN_SCANS_FOR_OFFSET = 10
+"""Least number of scans from which the mounting of the laser is found."""
+
+_LARGEST_OFFSET = 2.0
+"""Largest distance of the laser from the odometry's pose, m: farther away, the pose is a corrected one."""
+
+_SAME_OFFSET = 2e-3
+"""Largest difference of equal offsets, m and rad: poses are written with six decimals."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Sweep:
-    """A scan as a line tells it.
+    """A scan in a line.
 
-    :ivar ranges: shape (n,), float32, meters.
-    :ivar angle_min: rad.
-    :ivar increment: rad.
-    :ivar stated_max: the sensor's maximum where the line states it, meters, else inf.
+    :ivar ranges: shape (n,), float32, m.
+    :ivar angle_min: angle of the first beam, rad.
+    :ivar increment: angle between beams, rad.
+    :ivar stated_max: the sensor's maximum where the line states it, m, else inf.
     :ivar robot_pose: shape (3,), ``odom_T_base``.
     :ivar laser_pose: shape (3,), the line's pose of the laser, in the frame of the odometry or a corrected one.
-    :ivar is_front: a FLASER line, which tells less.
+    :ivar is_front: whether the line is FLASER, which has no angles and no maximum.
     """
 
     ranges: NDArray[np.float32]
@@ -84,7 +99,7 @@ class _Sweep:
 
 
 class _StampedLine(NamedTuple):
-    """An ODOM line's pose (3,), or a scan, with its stamp in ns."""
+    """The pose (3,) of an ODOM line, or a scan, with its stamp, ns."""
 
     stamp: int
     content: NDArray[np.float64] | _Sweep
@@ -92,28 +107,28 @@ class _StampedLine(NamedTuple):
 
 @dataclass
 class _ParsedFile:
-    """What the lines of a file hold."""
+    """The content of a file."""
 
     readings: list[_StampedLine] = field(default_factory=list)
     front_laser_offset: float = 0.0
 
 
 def is_carmen(content: bytes) -> bool:
-    """Whether one of the first lines is one that CARMEN writes."""
+    """Whether a line of CARMEN is in the first 64 kB."""
     return _KNOWN_LINE.search(content[:65536]) is not None
 
 
 def open_carmen(path: Path, content: bytes, window: TimeWindow) -> InMemoryLog:
     """A CARMEN log, in file order.
 
-    Odometry is taken from the ODOM lines and from the ``odom_*`` fields of FLASER or the robot pose of ROBOTLASER1,
-    which belong to the scan; the stamp is the ``ipc_timestamp``. FLASER does not state angles: the sweep begins at
-    -90 degrees; an odd number of beams includes both ends of the half circle, an even one leaves out the last. Nor
-    does it state the sensor's maximum, which `no_return_threshold` finds from all scans together.
+    Odometry is read from ODOM lines and, with each scan, from the ``odom_*`` fields of FLASER or the robot pose of
+    ROBOTLASER1. The stamp is the ``ipc_timestamp``. FLASER states no angles: the sweep begins at -90 degrees; an odd
+    number of beams includes both ends of the half circle, an even one excludes the last. Nor does it state the sensor's
+    maximum, which `no_return_threshold` finds from all scans together.
 
-    :param path: for the name.
-    :param content: the file, decompressed.
-    :param window: the part wanted.
+    :param path: path of the file, for the name of the log.
+    :param content: content of the file, decompressed.
+    :param window: part of the log to read.
     :raises HmtSlamError: where a line is cut off or malformed, or there is no scan.
     """
     parsed = _parse(content, path.name)
@@ -140,7 +155,7 @@ def _entries(readings: Iterable[_StampedLine], limits: dict[float, float], mount
 
 def _parse(content: bytes, name: str) -> _ParsedFile:
     parsed = _ParsedFile()
-    # Line by line: all of them at once would leave as much memory in pieces as the log itself takes.
+    # Line by line: splitting all at once would fragment as much memory as the log takes.
     for number, line in enumerate(io.BytesIO(content), start=1):
         tokens = line.split()
         if not tokens:
@@ -176,7 +191,7 @@ def _parse_flaser(tokens: list[bytes]) -> _StampedLine:
 
 
 def _parse_robotlaser(tokens: list[bytes]) -> _StampedLine:
-    """A laser that tells its geometry.
+    """A scan with its geometry.
 
     ``ROBOTLASER1 type start_angle field_of_view resolution maximum_range accuracy remission_mode n r1..rn
     m s1..sm laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv`` three safety fields and the trailer.
@@ -200,7 +215,7 @@ _PARSERS: dict[bytes, Callable[[list[bytes]], _StampedLine]] = {
 
 
 def _stamp(tokens: list[bytes], at: int) -> int:
-    """The stamp at the trailer's begin; the trailer must be there whole, and nothing behind it."""
+    """The stamp at the beginning of the trailer, which must be complete and end the line."""
     if len(tokens) != at + _TRAILER:
         raise ValueError("wrong number of fields")
     return stamp_from_seconds(tokens[at].decode())
@@ -211,9 +226,9 @@ def _numbers(tokens: list[bytes], begin: int, count: int) -> list[float]:
 
 
 def _range_limits(sweeps: Sequence[_Sweep]) -> dict[float, float]:
-    """The smallest range that means "no return", meters, by the maximum that the lines state (inf for none).
+    """{maximum stated by lines, m, inf for none: smallest range that means "no return", m}.
 
-    Sensors that state a maximum often report a smaller value for a beam without a return, so that is looked for too.
+    Sensors that state a maximum often report a smaller value for "no return", which is searched too.
     """
     limits = {}
     for stated in {sweep.stated_max: None for sweep in sweeps}:
@@ -225,9 +240,9 @@ def _range_limits(sweeps: Sequence[_Sweep]) -> dict[float, float]:
 class _Mountings:
     """``base_T_laser`` of each scan.
 
-    ROBOTLASER1 has both poses. In FLASER, the first pose is the laser's as the odometry has it, or a corrected pose
-    of the robot. Only in the first case is it at the same place relative to the odometry in every scan; then that is
-    the mounting. Else the log's robot_frontlaser_offset tells, and without it the laser is at the origin.
+    ROBOTLASER1 has both poses. The first pose of FLASER is the laser's by odometry, or a corrected pose of the robot.
+    Only the former has a constant offset from the odometry, which is then the mounting. Otherwise the mounting is the
+    robot_frontlaser_offset of the log, or the origin.
     """
 
     def __init__(self, sweeps: Sequence[_Sweep], front_laser_offset: float) -> None:
@@ -236,7 +251,7 @@ class _Mountings:
         self._front = np.array([front_laser_offset, 0.0, 0.0]) if front is None else front
 
     def laser_pose_of(self, sweep: _Sweep) -> NDArray[np.float64]:
-        """Shape (3,); poses that differ by rounding only are one."""
+        """``base_T_laser``, shape (3,); offsets that differ by rounding are replaced by the first of them."""
         if sweep.is_front:
             return self._front
         offset = se2.between(sweep.robot_pose, sweep.laser_pose)
@@ -248,7 +263,7 @@ class _Mountings:
 
 
 def _constant_offset(sweeps: Sequence[_Sweep]) -> NDArray[np.float64] | None:
-    if len(sweeps) < _FEWEST_SCANS_FOR_OFFSET:
+    if len(sweeps) < _MIN_SCANS_FOR_OFFSET:
         return None
     robot = np.array([sweep.robot_pose for sweep in sweeps])
     offsets = se2.between(robot, np.array([sweep.laser_pose for sweep in sweeps]))

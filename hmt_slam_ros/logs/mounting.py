@@ -1,4 +1,4 @@
-"""Where a laser is mounted on the robot, from a bag's transforms, and the plane in which it measures."""
+"""The mounting of a laser on the robot, from transforms."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from hmt_slam_ros.errors import HmtSlamError
 if TYPE_CHECKING:
     from hmt_slam_ros.logs.ros_types import RosMessage
 
-_LARGEST_TILT = np.deg2rad(10.0)  # beyond it, ranges are too far from distances on the floor plan
+_LARGEST_TILT = np.deg2rad(10.0)
+"""Largest tilt of a scan plane, rad: beyond it, ranges differ too much from distances on the floor plan."""
 
 
 class Mounting(NamedTuple):
-    """Where a laser is in the plane.
+    """The planar mounting of a laser.
 
     :ivar laser_pose: shape (3,), ``base_T_laser`` as (x, y, theta) in m and rad.
-    :ivar angle_sign: 1.0, or -1.0 for a laser mounted upside down: its angles count the other way round.
+    :ivar angle_sign: 1.0, or -1.0 for a laser that is upside down, whose angles increase clockwise.
     """
 
     laser_pose: NDArray[np.float64]
@@ -28,10 +29,10 @@ class Mounting(NamedTuple):
 
 
 def planar_mounting(base_T_laser: ArrayLike, laser_name: str) -> Mounting:
-    """The planar pose of a laser whose scan plane is level, upright or upside down.
+    """The planar mounting of a level laser, upright or upside down.
 
     :param base_T_laser: shape (4, 4), homogeneous transform, meters.
-    :param laser_name: for the message.
+    :param laser_name: name for the error message.
     :raises HmtSlamError: where the scan plane is tilted by more than 10 degrees.
     """
     transform = np.asarray(base_T_laser, dtype=np.float64)
@@ -47,10 +48,10 @@ def planar_mounting(base_T_laser: ArrayLike, laser_name: str) -> Mounting:
 
 
 def transform_from_quaternion(translation: ArrayLike, quaternion: ArrayLike) -> NDArray[np.float64]:
-    """Homogeneous transform (4, 4).
+    """The homogeneous transform, shape (4, 4), m.
 
-    :param translation: (x, y, z) in meters.
-    :param quaternion: (x, y, z, w), of any length but zero.
+    :param translation: (x, y, z), m.
+    :param quaternion: (x, y, z, w), of any norm but zero.
     """
     x, y, z, w = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
     transform = np.eye(4)
@@ -63,13 +64,19 @@ def transform_from_quaternion(translation: ArrayLike, quaternion: ArrayLike) -> 
     return transform
 
 
-def heading_from_quaternion(quaternion: ArrayLike) -> float:
-    """Rotation about z, rad; exact to the last bits where the rotation is about z alone.
+def transform_from_message(transform: RosMessage) -> NDArray[np.float64]:
+    """The homogeneous transform, shape (4, 4), m, of a geometry_msgs/Transform."""
+    shift, turn = transform.translation, transform.rotation
+    return transform_from_quaternion((shift.x, shift.y, shift.z), (turn.x, turn.y, turn.z, turn.w))
 
-    :param quaternion: (x, y, z, w), of any length but zero.
+
+def heading_from_quaternion(quaternion: ArrayLike) -> float:
+    """The rotation about z, rad; exact where the rotation is about z alone.
+
+    :param quaternion: (x, y, z, w), of any norm but zero.
     """
     x, y, z, w = np.asarray(quaternion, dtype=np.float64).tolist()
-    # The arctan2 of numpy 1.26 is off by several last bits on processors with AVX-512; that of the C library is not.
+    # numpy 1.26 computes arctan2 with errors of several ulp on processors with AVX-512; math.atan2 is exact.
     if x == 0.0 and y == 0.0:
         heading = 2.0 * math.atan2(z, w)
         return heading - 2.0 * math.pi * round(heading / (2.0 * math.pi))
@@ -77,28 +84,26 @@ def heading_from_quaternion(quaternion: ArrayLike) -> float:
 
 
 class FrameTree:
-    """Frames and the transforms that join them.
+    """A tree of frames and the transforms between them.
 
-    Of several transforms of one child frame the first counts, as in a log, which is read from its beginning for every
-    scan, or the newest, as in a robot.
+    Of several transforms of a child frame, the first counts in a log and the newest on a robot.
     """
 
     def __init__(self, *, newest: bool = False) -> None:
-        """:param newest: whether the newest counts."""
+        """:param newest: whether the newest transform of a child frame counts, else the first."""
         self._newest = newest
         self._parents: dict[str, tuple[str, NDArray[np.float64]]] = {}
 
     def add(self, message: RosMessage) -> None:
-        """Take in a tf2_msgs/TFMessage."""
-        for joint in message.transforms:
-            child = frame_name(joint.child_frame_id)
+        """Add a tf2_msgs/TFMessage."""
+        for stamped in message.transforms:
+            child = frame_name(stamped.child_frame_id)
             if self._newest or child not in self._parents:
-                move, turn = joint.transform.translation, joint.transform.rotation
-                transform = transform_from_quaternion((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w))
-                self._parents[child] = (frame_name(joint.header.frame_id), transform)
+                parent = frame_name(stamped.header.frame_id)
+                self._parents[child] = (parent, transform_from_message(stamped.transform))
 
     def lookup_transform(self, base: str, frame: str) -> NDArray[np.float64] | None:
-        """``base_T_frame``, shape (4, 4), meters; None where no chain of transforms joins the two."""
+        """``base_T_frame``, shape (4, 4), m; None where no chain of transforms connects the two."""
         to_frame, to_base = self._ancestor_transforms(frame), self._ancestor_transforms(base)
         for ancestor, ancestor_T_frame in to_frame.items():
             if ancestor in to_base:
@@ -107,7 +112,7 @@ class FrameTree:
         return None
 
     def _ancestor_transforms(self, frame: str) -> dict[str, NDArray[np.float64]]:
-        """Each ancestor of a frame, itself included, with ``ancestor_T_frame``, nearest first."""
+        """{ancestor: ``ancestor_T_frame``}, from the frame itself to the root."""
         chain = {frame: np.eye(4)}
         while frame in self._parents and self._parents[frame][0] not in chain:
             parent, transform = self._parents[frame]
@@ -117,5 +122,5 @@ class FrameTree:
 
 
 def frame_name(frame: str) -> str:
-    """A frame without the leading slash that ROS 1 wrote."""
+    """The name of a frame without the leading slash of ROS 1."""
     return frame.lstrip("/")

@@ -1,8 +1,8 @@
-"""MRPT rawlogs: scans with the actions between them, or a plain sequence of observations.
+"""MRPT rawlogs: actions and observations in turn, or observations alone.
 
 An object is: one byte with bit 7 set and the length of the class name in the others; the name; one byte with the
 version; the fields, little endian, which may be objects themselves; the byte 0x88. The fields of each class and
-version are facts of the format, taken from MRPT's documentation and source (``serializeFrom`` of each class).
+version follow MRPT's documentation and source (``serializeFrom`` of each class).
 """
 
 from __future__ import annotations
@@ -23,7 +23,13 @@ from hmt_slam_ros.logs.records import InMemoryLog, LogEntry, TimeWindow
 from hmt_slam_ros.sensors import Odometry, Scan
 
 _END_OF_OBJECT = 0x88
+"""Byte at the end of an object."""
+
 _ODOMETRY_METHOD = 0
+"""Value of a movement's method for wheel odometry."""
+
+_TICKS_TO_1970 = 116_444_736_000_000_000
+"""MRPT counts ticks of 100 ns from the year 1601: ticks until 1970."""
 
 _Kind = TypeVar("_Kind")
 
@@ -33,13 +39,13 @@ class RangeScan:
     """A planar scan.
 
     :ivar ticks: time in units of 100 ns since 1601.
-    :ivar ranges: shape (n,), float32, meters.
-    :ivar valid: shape (n,), uint8, 0 for a beam that the sensor or its driver declared faulty.
+    :ivar ranges: shape (n,), float32, m.
+    :ivar valid: shape (n,), uint8, 0 for a faulty beam.
     :ivar aperture: angle from the first beam to the last, rad.
-    :ivar right_to_left: True where angles increase from beam to beam.
-    :ivar max_range: largest range of the sensor, meters.
-    :ivar sensor_pose: ``base_T_laser``, shape (4, 4), meters.
-    :ivar sweep_duration: seconds from the first beam to the last, 0 where unknown.
+    :ivar right_to_left: whether angles increase from beam to beam.
+    :ivar max_range: largest range of the sensor, m.
+    :ivar sensor_pose: ``base_T_laser``, shape (4, 4), m.
+    :ivar sweep_duration: time from the first beam to the last, s, 0 where unknown.
     """
 
     ticks: int
@@ -70,7 +76,7 @@ class RobotMovement:
 
 @dataclass(frozen=True)
 class ActionCollection:
-    """What the robot did between two frames."""
+    """The movements of the robot between two frames."""
 
     actions: list[object]
 
@@ -83,7 +89,7 @@ class SensoryFrame:
 
 
 def is_rawlog(content: bytes) -> bool:
-    """Whether the content begins as an object does: with the marked length of a class name, and that name."""
+    """Whether the content begins like an object, with the marked length of a class name and that name."""
     length = content[0] & 0x7F if content else 0
     name = content[1 : 1 + length]
     return bool(content) and content[0] > 0x80 and name.replace(b":", b"").isalnum() and len(name) == length
@@ -92,8 +98,8 @@ def is_rawlog(content: bytes) -> bool:
 class ObjectStream:
     """The top-level objects of a rawlog, in order.
 
-    :param content: the file, decompressed.
-    :param name: of the log, for messages.
+    :param content: content of the file, decompressed.
+    :param name: name of the log, for error messages.
     """
 
     def __init__(self, content: bytes, name: str) -> None:
@@ -102,7 +108,7 @@ class ObjectStream:
         self._offset = 0
 
     def __iter__(self) -> Iterator[object]:
-        """Every object.
+        """All objects.
 
         :raises HmtSlamError: where the content ends inside an object or is of an unknown class or version.
         """
@@ -110,7 +116,7 @@ class ObjectStream:
             yield self.next_object()
 
     def next_object(self) -> object:
-        """The object that starts here, read to its end."""
+        """The object at the current offset."""
         name_length = self.integer("B") & 0x7F
         class_name = self._read_bytes(name_length).decode("ascii", "replace").removeprefix("mrpt::").split("::")[-1]
         reader = _READERS.get(class_name)
@@ -125,9 +131,9 @@ class ObjectStream:
         return result
 
     def nested_object(self, kind: type[_Kind]) -> _Kind:
-        """The object that starts here, of the kind that its owner's class demands.
+        """The object at the current offset, which must be of a given kind.
 
-        :raises HmtSlamError: where it is of another.
+        :raises HmtSlamError: where it is of another kind.
         """
         result = self.next_object()
         if not isinstance(result, kind):
@@ -135,15 +141,15 @@ class ObjectStream:
         return result
 
     def pose(self) -> NDArray[np.float64]:
-        """A nested object that stands for a pose or matrix."""
+        """A nested object that is a pose or a matrix."""
         return self.nested_object(np.ndarray)
 
     def integer(self, code: str) -> int:
-        """One integer, by its code of the struct module."""
+        """An integer, by its code in the struct module."""
         return int(struct.unpack("<" + code, self._read_bytes(struct.calcsize(code)))[0])
 
     def real(self, code: str) -> float:
-        """One floating-point number, by its code of the struct module."""
+        """A floating-point number, by its code in the struct module."""
         return float(struct.unpack("<" + code, self._read_bytes(struct.calcsize(code)))[0])
 
     def numbers(self, dtype: str, count: int) -> NDArray[Any]:
@@ -152,11 +158,11 @@ class ObjectStream:
         return np.frombuffer(self._read_bytes(kind.itemsize * count), dtype=kind)
 
     def skip_text(self) -> None:
-        """Pass over a character string."""
+        """Skip a character string."""
         self._read_bytes(self.integer("I"))
 
     def check_version(self, class_name: str, version: int, newest: int, oldest: int = 0) -> None:
-        """Check that a version of a class is one that the reader knows.
+        """Check that the version of a class is known.
 
         :raises HmtSlamError: where it is not.
         """
@@ -230,7 +236,7 @@ def _movement(stream: ObjectStream, version: int) -> RobotMovement:
 
 
 def _skip_velocities_and_encoders(stream: ObjectStream, *, old: bool) -> None:
-    """Old versions store both whether they are known or not, velocities as two floats."""
+    """Skip velocities and encoder ticks. Old versions always store both, velocities as two floats."""
     has_velocities = stream.integer("?")
     if old:
         stream.numbers("f4", 2)
@@ -306,19 +312,16 @@ _READERS: dict[str, Callable[[ObjectStream, int], object]] = {
 }
 
 
-_TICKS_TO_1970 = 116_444_736_000_000_000  # MRPT counts 100 ns ticks from the year 1601
-
-
 def open_rawlog(path: Path, content: bytes, window: TimeWindow) -> InMemoryLog:
     """An MRPT rawlog.
 
-    In the action-observation form, the odometry increments of the actions are summed up from the origin; the sum is
-    the odometry reading of the first scan of the observations that follow. Where the log also has absolute
-    odometry readings, those are used and the increments are left out.
+    In the action-observation form, the odometry increments of the actions are composed from the origin on. The sum is
+    the odometry reading of the first scan after an action. Where the log has absolute odometry readings, these replace
+    the increments.
 
-    :param path: for the name.
-    :param content: the file, decompressed.
-    :param window: the part wanted.
+    :param path: path of the file, for the name of the log.
+    :param content: content of the file, decompressed.
+    :param window: part of the log to read.
     :raises HmtSlamError: where the file is truncated, holds an object of an unknown class or version, or no scan.
     """
     objects = list(ObjectStream(content, path.name))
@@ -337,7 +340,7 @@ def _observations(objects: Iterable[object]) -> Iterator[object]:
 
 def _entries(objects: Iterable[object], name: str, *, with_increments: bool) -> Iterator[LogEntry]:
     odom_T_base = np.zeros(3)
-    due = with_increments  # an odometry reading is due at the first scan behind an action, and at the first of all
+    due = with_increments  # at the first scan, and at the first one after an action
     for item in _observations(objects):
         if isinstance(item, ActionCollection) and with_increments:
             odom_T_base = se2.compose(odom_T_base, _increment(item, name))
@@ -359,7 +362,7 @@ def _stamp(ticks: int, name: str) -> int:
 
 
 def _increment(actions: ActionCollection, name: str) -> NDArray[np.float64]:
-    """The movement by wheel odometry where there is one, else the first of any kind, shape (3,)."""
+    """The first movement by wheel odometry, else the first of any kind, shape (3,)."""
     movements = [action for action in actions.actions if isinstance(action, RobotMovement)]
     movements.sort(key=lambda movement: not movement.is_odometry)
     if not movements:
@@ -368,11 +371,11 @@ def _increment(actions: ActionCollection, name: str) -> NDArray[np.float64]:
 
 
 def _scan_fields(scan: RangeScan, name: str) -> tuple[object, ...]:
-    """The fields of `Scan` behind the stamp. The beams span the aperture, ends included."""
+    """The fields of `Scan` after the stamp. The beams span the aperture, both ends included."""
     mounting = planar_mounting(scan.sensor_pose, f"the laser of {name}")
     side = mounting.angle_sign if scan.right_to_left else -mounting.angle_sign
     ranges = scan.ranges.copy()
-    # The flag is the only mark of some faulty beams: their range lies inside the limits.
+    # Some faulty beams have ranges inside the limits: only the flag marks them.
     ranges[(scan.valid == 0) & (ranges < scan.max_range)] = np.nan
     increment = scan.aperture / max(ranges.size - 1, 1)
     time_increment = scan.sweep_duration / max(ranges.size - 1, 1)

@@ -1,4 +1,4 @@
-"""What every log, whatever its format, is read as, and logs that are held in memory once parsed."""
+"""The interface of all logs, and logs in memory."""
 
 from __future__ import annotations
 
@@ -14,24 +14,22 @@ from hmt_slam_ros.logs.stamps import NANOSECONDS, running_stamps
 from hmt_slam_ros.sensors import Odometry, Scan
 
 SIMULATION_PREFIX = "sim:"
-"""What the name of a log begins with that is made while it is read."""
+"""Prefix of the names of simulated logs."""
 
 
 @dataclass(frozen=True, slots=True)
 class LogRecord:
     """One measurement of a log, in file order.
 
-    The stamps of the measurements come from one running clock over all records of the log in file order: each is
-    the later of the record's source stamp and the last stamp given. A scan lies strictly after the scan before it
-    and an odometry reading strictly after the odometry reading before it, 1 microsecond where the source does not
-    advance. An odometry reading that belongs to a scan (the odometry fields of a CARMEN scan, the action before a
-    rawlog's observation) has exactly the scan's stamp and comes just before it. A part of a log has the stamps that
-    the same records have in the whole log.
+    All records of a log in file order have stamps of one running clock: each is the later of the record's source stamp
+    and the last stamp. Scans have increasing stamps, and so have odometry readings, 1 microsecond apart where the
+    source does not advance. An odometry reading that belongs to a scan (the odometry fields of a CARMEN scan, the
+    action before a rawlog's observation) has the stamp of the scan and comes directly before it. Records of a part of a
+    log have the stamps that they have in the whole log.
 
-    :ivar source_stamp: the log's own time stamp in ns, which may jump back; results are keyed by it.
+    :ivar source_stamp: the log's own stamp, ns, which may jump back; results are keyed by it.
     :ivar measurement: the scan or odometry reading, with its ``stamp`` from the running clock, ns.
-    :ivar true_pose: shape (3,), the robot's true pose ``world_T_base`` at that time, m and rad; None where nobody knows
-        it.
+    :ivar true_pose: shape (3,), the robot's true pose ``world_T_base``, m and rad; None where unknown.
     """
 
     source_stamp: int
@@ -48,7 +46,7 @@ class Log(Protocol):
 
     @property
     def scan_count(self) -> int:
-        """Number of scans that `records` yields."""
+        """Number of scans in `records`."""
 
     @property
     def duration(self) -> float:
@@ -57,18 +55,17 @@ class Log(Protocol):
     def records(self) -> Iterator[LogRecord]:
         """All measurements in file order, from the start at every call.
 
-        :raises HmtSlamError: where the file is damaged, when that place is reached; everything that can be noticed
-            earlier is refused when the log is opened.
+        :raises HmtSlamError: at a damaged record, where opening the log could not find the damage.
         """
 
 
 class LogEntry(NamedTuple):
-    """A measurement that still waits for its stamp.
+    """A measurement without a stamp of the running clock.
 
-    :ivar source_stamp: the log's own time stamp, ns.
+    :ivar source_stamp: the log's own stamp, ns.
     :ivar kind: `Scan` or `Odometry`.
-    :ivar fields: the measurement's fields behind ``stamp``, in their order.
-    :ivar precedes_its_scan: True for an odometry reading that belongs to the scan right behind it.
+    :ivar fields: fields of the measurement after ``stamp``, in order.
+    :ivar precedes_its_scan: whether this is odometry that belongs to the scan directly after it.
     """
 
     source_stamp: int
@@ -79,10 +76,10 @@ class LogEntry(NamedTuple):
 
 @dataclass(frozen=True)
 class TimeWindow:
-    """The part of a log that is wanted.
+    """A part of a log.
 
-    :ivar start: seconds from the log's first stamp.
-    :ivar duration: seconds, None for all that follows.
+    :ivar start: start after the log's first stamp, s.
+    :ivar duration: duration, s, None for the rest of the log.
     """
 
     start: float = 0.0
@@ -95,7 +92,7 @@ class TimeWindow:
             raise HmtSlamError(f"duration is {self.duration} s: give more than 0, or leave it away for the whole log.")
 
     def select(self, stamps: NDArray[np.int64]) -> slice:
-        """The records inside: ``start <= stamp - stamps[0] <= start + duration``.
+        """The records with ``start <= stamp - stamps[0] <= start + duration``.
 
         :param stamps: shape (n,), ns, not decreasing.
         """
@@ -110,9 +107,9 @@ class TimeWindow:
 
 
 def require_scans(name: str, in_window: int, in_log: int) -> None:
-    """Refuse a log, or a part of a log, without scans.
+    """Check that a log, and the selected part of it, has scans.
 
-    :raises HmtSlamError: saying which of the two it is.
+    :raises HmtSlamError: where one has none; says which.
     """
     if not in_log:
         raise HmtSlamError(f"{name} holds no laser scan: give a log in which scans were recorded.")
@@ -121,7 +118,7 @@ def require_scans(name: str, in_window: int, in_log: int) -> None:
 
 
 class InMemoryLog:
-    """A log whose measurements are all in memory.
+    """A log with all measurements in memory; the attributes are those of `Log`.
 
     :raises HmtSlamError: where there is no scan.
     """
@@ -132,26 +129,12 @@ class InMemoryLog:
             [entry.source_stamp for entry in entries], is_scan, [entry.precedes_its_scan for entry in entries]
         )
         part = window.select(stamps)
-        self._name = name
+        self.name = name
+        self.scan_count = sum(is_scan[part])
+        require_scans(name, self.scan_count, sum(is_scan))
         self._entries = entries[part]
         self._stamps = stamps[part]
-        self._scan_count = sum(is_scan[part])
-        require_scans(name, self._scan_count, sum(is_scan))
-
-    @property
-    def name(self) -> str:
-        """Short name for reports."""
-        return self._name
-
-    @property
-    def scan_count(self) -> int:
-        """Number of scans."""
-        return self._scan_count
-
-    @property
-    def duration(self) -> float:
-        """Seconds from the first to the last record."""
-        return float(self._stamps[-1] - self._stamps[0]) / NANOSECONDS
+        self.duration = float(self._stamps[-1] - self._stamps[0]) / NANOSECONDS
 
     def records(self) -> Iterator[LogRecord]:
         """All measurements in file order."""

@@ -1,4 +1,4 @@
-"""The ROS messages of a bag, by the rosbags library: no ROS installation is needed."""
+"""ROS messages of bags, by the rosbags library, without a ROS installation."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 POSE = "geometry_msgs/msg/PoseStamped"
 
 GROUND_TRUTH_TOPIC = "/ground_truth"
-"""Of the robot's true poses, where somebody knows them."""
+"""Topic of the robot's true poses in simulated bags."""
 
 RosMessage: TypeAlias = Any
-"""A message of the rosbags library, whose classes are made at run time: type checkers do not know their fields."""
+"""A message of the rosbags library, which makes its classes at run time, so that type checkers know no fields."""
 
 
 @cache
@@ -27,5 +27,5 @@ def typestore() -> Typestore:
 
 
 def deserialize(content: bytes, message_type: str) -> RosMessage:
-    """A message from its bytes in a bag (CDR)."""
+    """The message of its bytes in CDR."""
     return typestore().deserialize_cdr(content, message_type)

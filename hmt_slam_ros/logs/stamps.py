@@ -1,4 +1,4 @@
-"""Time stamps as integer nanoseconds, and the one running clock of a log."""
+"""Time stamps as integer nanoseconds, and the running clock of a log."""
 
 from __future__ import annotations
 
@@ -9,16 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 NANOSECONDS = 1_000_000_000
+"""Nanoseconds in a second."""
 
-_LARGEST = 2**62  # ns, in the year 2116; beyond it sums no longer fit into 64 bits
-_STEP = 1_000  # ns between two readings of one kind where the source's clock does not advance
+_LARGEST = 2**62
+"""Largest stamp, ns, in the year 2116: sums of two fit into 64 bits."""
+
+_STEP = 1_000
+"""Time between two readings of one kind where the source's clock does not advance, ns."""
 
 
 def stamp_from_seconds(text: str) -> int:
-    """Nanoseconds of a decimal number of seconds, exact: a float64 keeps only 100 ns of a stamp of this century.
+    """Nanoseconds of a decimal number of seconds, exact. A float64 would round a stamp of today to 100 ns.
 
-    :param text: such as ``976052857.337284`` or ``1.4e3``; digits beyond the ninth decimal are cut off.
-    :raises ValueError: where the text is no number, or too large a one.
+    :param text: such as ``976052857.337284`` or ``1.4e3``; digits after the ninth decimal are ignored.
+    :raises ValueError: where the text is no number, or too large.
     """
     whole, _, fraction = text.partition(".")
     try:
@@ -42,11 +46,11 @@ def seconds_from_stamp(stamp: int) -> str:
 def running_stamps(
     sources: Sequence[int], is_scan: Sequence[bool], precedes_its_scan: Sequence[bool]
 ) -> NDArray[np.int64]:
-    """Stamps of one running clock over all readings of a log, shape (n,), ns; the rule is in `LogRecord`.
+    """Stamps of the running clock that `LogRecord` describes, for all readings of a log, shape (n,), ns.
 
     :param sources: the log's own stamps in file order, ns.
-    :param is_scan: scan (True) or odometry reading (False).
-    :param precedes_its_scan: True for an odometry reading that belongs to the scan right behind it.
+    :param is_scan: whether each reading is a scan, else odometry.
+    :param precedes_its_scan: whether each reading is odometry that belongs to the scan directly after it.
     """
     stamps = np.empty(len(sources), dtype=np.int64)
     last_scan = last_odometry = last = min(sources, default=0) - _STEP

@@ -1,4 +1,4 @@
-"""Writing any log as a rosbag2, so that every ROS 2 tool can play it."""
+"""Writes any log as a rosbag2."""
 
 from __future__ import annotations
 
@@ -29,17 +29,19 @@ from hmt_slam_ros.sensors import Odometry, Scan
 ODOM_FRAME, BASE_FRAME, LASER_FRAME, WORLD_FRAME = "odom", "base_link", "laser", "world"
 
 _STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
-_NO_DEADLINE = QosTime(9223372036, 854775807)  # "no deadline", as rosbag2 itself writes it
+"""{name of a storage: plug-in}."""
+
+_NO_DEADLINE = QosTime(9223372036, 854775807)
+"""The value of rosbag2 for "no deadline"."""
 
 
 def write_bag(log: Log, destination: Path, *, storage: str = "mcap") -> None:
     """Write a log as a rosbag2 folder with /scan, /odom, /tf (odom -> base_link) and /tf_static (base_link -> laser).
 
-    Where the log knows the truth, /ground_truth has the pose ``world_T_base`` at every scan and odometry reading.
-
-    The bag's own times are the running clock's, so they never jump back; each header holds the source stamp, so a
-    reader gets back the log's own stamps, and by the same rule the same running clock. Angles become float32, as the
-    message has them. Where the laser's pose changes within the log, each pose is a frame of its own: laser, laser_1...
+    Where the log has true poses, /ground_truth has ``world_T_base`` at every scan and odometry reading. The bag times
+    are those of the running clock, so they never jump back. Each header has the source stamp, from which a reader gets
+    the log's own stamps and the same running clock. Angles become float32, the type of the message. Each laser pose of
+    a log has a frame: laser, laser_1 and so on.
 
     :raises HmtSlamError: where the folder exists or cannot be written; nothing is left behind.
     """
@@ -92,7 +94,7 @@ def _qos(topic: str) -> Qos:
 
 
 def _laser_frames(log: Log) -> dict[bytes, tuple[str, NDArray[np.float64]]]:
-    """Name and pose of every laser frame, by the bytes of the pose, in the order of their first scans."""
+    """{bytes of a laser pose: (name of its frame, pose)}, in the order of the first scans."""
     frames: dict[bytes, tuple[str, NDArray[np.float64]]] = {}
     for record in log.records():
         if isinstance(record.measurement, Scan):
@@ -104,21 +106,21 @@ def _laser_frames(log: Log) -> dict[bytes, tuple[str, NDArray[np.float64]]]:
 def _messages(
     records: Iterable[LogRecord], frames: dict[bytes, tuple[str, NDArray[np.float64]]]
 ) -> Iterator[tuple[str, int, RosMessage]]:
-    """Topic, bag time in ns and message, in the order of the bag."""
-    told = None
+    """Topic, bag time, ns, and message, in the order of the bag."""
+    last_truth = None
     for k, record in enumerate(records):
         measurement, source = record.measurement, record.source_stamp
         if k == 0:
-            joints = [_transform(source, BASE_FRAME, frame, pose) for frame, pose in frames.values()]
-            yield "/tf_static", measurement.stamp, _message(TRANSFORMS, transforms=joints)
-        if record.true_pose is not None and measurement.stamp != told:
-            told = measurement.stamp
+            transforms = [_transform(source, BASE_FRAME, frame, pose) for frame, pose in frames.values()]
+            yield "/tf_static", measurement.stamp, _message(TRANSFORMS, transforms=transforms)
+        if record.true_pose is not None and measurement.stamp != last_truth:
+            last_truth = measurement.stamp
             pose = _pose(record.true_pose)
-            yield GROUND_TRUTH_TOPIC, told, _message(POSE, header=_header(source, WORLD_FRAME), pose=pose)
+            yield GROUND_TRUTH_TOPIC, last_truth, _message(POSE, header=_header(source, WORLD_FRAME), pose=pose)
         if isinstance(measurement, Odometry):
             yield "/odom", measurement.stamp, _odometry(source, measurement)
-            joints = [_transform(source, ODOM_FRAME, BASE_FRAME, measurement.pose)]
-            yield "/tf", measurement.stamp, _message(TRANSFORMS, transforms=joints)
+            transforms = [_transform(source, ODOM_FRAME, BASE_FRAME, measurement.pose)]
+            yield "/tf", measurement.stamp, _message(TRANSFORMS, transforms=transforms)
         else:
             frame, _ = frames[measurement.laser_pose.tobytes()]
             yield "/scan", measurement.stamp, _laser_scan(source, measurement, frame)
@@ -146,9 +148,9 @@ def _rotation(theta: float) -> RosMessage:
 def _transform(stamp: int, parent: str, child: str, parent_T_child: NDArray[np.float64]) -> RosMessage:
     """A geometry_msgs/TransformStamped of the rosbags library for a planar pose (3,)."""
     x, y, theta = parent_T_child.tolist()
-    joint = _message("geometry_msgs/msg/Transform", translation=_vector("Vector3", x, y), rotation=_rotation(theta))
+    transform = _message("geometry_msgs/msg/Transform", translation=_vector("Vector3", x, y), rotation=_rotation(theta))
     return _message(
-        "geometry_msgs/msg/TransformStamped", header=_header(stamp, parent), child_frame_id=child, transform=joint
+        "geometry_msgs/msg/TransformStamped", header=_header(stamp, parent), child_frame_id=child, transform=transform
     )
 
 

@@ -1,1 +1,1 @@
-"""The messages between the processes, their documents, who hears what, and the map as messages tell it."""
+"""The messages between the processes, their documents and subscriptions, and the replica of the map."""

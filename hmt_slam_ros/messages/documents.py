@@ -1,7 +1,7 @@
-"""Messages as versioned JSON documents, for the topics that no standard ROS type fits.
+"""Messages as versioned JSON documents, for topics without a standard ROS type.
 
-The form of a document follows from the dataclass that it carries (:mod:`hmt_slam_ros.plain_data`); an array is a list.
-What is received is checked against the same dataclass, so that nothing malformed reaches a process.
+The form of a document follows from the class of its message (:mod:`hmt_slam_ros.plain_data`); an array is a list. A
+received document is checked against that class, so that no malformed message reaches a process.
 """
 
 from __future__ import annotations
@@ -54,46 +54,28 @@ class KeyframeHeader:
 
     @classmethod
     def from_keyframe(cls, keyframe: Keyframe) -> KeyframeHeader:
-        """What is left of a keyframe without the ranges."""
-        scan = keyframe.scan
-        geometry = ScanGeometry(**{entry.name: getattr(scan, entry.name) for entry in fields(ScanGeometry)})
-        return cls(
-            keyframe.sequence,
-            geometry,
-            keyframe.path_length,
-            keyframe.estimates,
-            keyframe.motion_unknown,
-            keyframe.initial_pose,
-            keyframe.mapping,
-            keyframe.stale_beams,
-        )
+        """The header of a keyframe."""
+        geometry = {entry.name: getattr(keyframe.scan, entry.name) for entry in fields(ScanGeometry)}
+        header = {entry.name: getattr(keyframe, entry.name) for entry in fields(cls)}
+        return cls(**header | {"scan": ScanGeometry(**geometry)})
 
     def to_keyframe(self, ranges: NDArray[np.float32]) -> Keyframe:
-        """The keyframe.
+        """The keyframe with its ranges.
 
         :param ranges: shape (n,), m.
         """
         geometry = {entry.name: getattr(self.scan, entry.name) for entry in fields(self.scan)}
-        scan = Scan(ranges=ranges, **geometry)
-        return Keyframe(
-            self.sequence,
-            scan,
-            self.path_length,
-            self.estimates,
-            self.motion_unknown,
-            self.initial_pose,
-            self.mapping,
-            self.stale_beams,
-        )
+        header = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return Keyframe(**header | {"scan": Scan(ranges=ranges, **geometry)})
 
 
 @dataclass(frozen=True, eq=False)
 class FinalCounts:
-    """slam's last word, and what it had said until then.
+    """The last message of slam, with the numbers of its messages before.
 
-    :ivar totals: the message itself.
-    :ivar keyframes: keyframe events.
-    :ivar scan_poses: trails.
+    :ivar totals: the last message.
+    :ivar keyframes: number of ``Keyframe`` messages.
+    :ivar scan_poses: number of ``ScanPoses`` messages.
     """
 
     totals: EndOfRun
@@ -105,13 +87,13 @@ class FinalCounts:
 class RobotStatus:
     """Progress of the robot node.
 
-    :ivar state: "waiting" for subscribers, "playing", "paused", or "ended": no more scans will come.
+    :ivar state: "waiting" for subscribers, "playing", "paused", or "ended" where no more scans follow.
     :ivar log: name of the log.
-    :ivar stamp: of the last record sent, ns, 0 before the first.
-    :ivar scans: scans sent.
-    :ivar scans_in_log: scans that one pass over the log has.
-    :ivar odometry_readings: odometry readings sent.
-    :ivar acknowledged: scans for which slam gave a pose.
+    :ivar stamp: stamp of the last record sent, ns, 0 before the first.
+    :ivar scans: number of scans sent.
+    :ivar scans_in_log: number of scans in the log.
+    :ivar odometry_readings: number of odometry readings sent.
+    :ivar acknowledged: number of scans for which slam sent a pose.
     """
 
     state: Literal["waiting", "playing", "paused", "ended"]
@@ -125,11 +107,11 @@ class RobotStatus:
 
 @dataclass(frozen=True, eq=False)
 class SaveRequest:
-    """slam asks the others for their parts of a map.
+    """slam requests that all processes save their parts of a map.
 
-    :ivar number: of the request, larger than those before.
-    :ivar events: keyframe events after which all parts are.
-    :ivar folder: into which they are written.
+    :ivar number: number of the request, larger than those before.
+    :ivar events: number of keyframe events after which each process saves.
+    :ivar folder: folder for the files.
     :ivar shutdown: whether all nodes end afterwards.
     """
 
@@ -143,10 +125,10 @@ class SaveRequest:
 class SaveResponse:
     """The answer to a :class:`SaveRequest`.
 
-    :ivar number: of the request.
-    :ivar process: the process that answers.
-    :ivar files: what it wrote.
-    :ivar error: what went wrong, empty where nothing did.
+    :ivar number: number of the request.
+    :ivar process: name of the process that answers.
+    :ivar files: files that it wrote.
+    :ivar error: sentence about a fault, empty without one.
     """
 
     number: int
@@ -157,11 +139,11 @@ class SaveResponse:
 
 @dataclass(frozen=True, eq=False)
 class ResetRequest:
-    """slam asks the others to begin anew.
+    """slam requests that all processes reset.
 
-    :ivar number: of the request, larger than those before.
-    :ivar events: keyframe events after which all do.
-    :ivar folder: the map with which they begin, empty where with none.
+    :ivar number: number of the request, larger than those before.
+    :ivar events: number of keyframe events after which each process resets.
+    :ivar folder: folder of the map to load, empty for none.
     """
 
     number: int
@@ -173,9 +155,9 @@ class ResetRequest:
 class ResetResponse:
     """The answer to a :class:`ResetRequest`.
 
-    :ivar number: of the request.
-    :ivar process: the process that answers.
-    :ivar error: what went wrong, empty where nothing did.
+    :ivar number: number of the request.
+    :ivar process: name of the process that answers.
+    :ivar error: sentence about a fault, empty without one.
     """
 
     number: int
@@ -184,12 +166,13 @@ class ResetResponse:
 
 
 _DOCUMENTS: dict[type, tuple[str, int]] = {row.message_class: (row.document, row.version) for row in DOCUMENTS}
+"""{class of a message: (name, version) of its document}."""
 
 
 def encode(message: object, reset_number: int = 0) -> str:
     """The JSON document of a message, of a :class:`KeyframeHeader`, :class:`FinalCounts` or :class:`RobotStatus`.
 
-    :param reset_number: number of the request after which all began anew, 0 before the first.
+    :param reset_number: number of the last reset, 0 before the first.
     :raises HmtSlamError: where a float is NaN or infinite.
     """
     name, version = _DOCUMENTS[type(message)]
@@ -205,14 +188,14 @@ def encode(message: object, reset_number: int = 0) -> str:
 def decode(text: str, kind: type[Document]) -> Document:
     """The message of a JSON document.
 
-    :param kind: what the document has to be.
-    :raises HmtSlamError: where it is something else, of another version, or malformed; names the field.
+    :param kind: class of the message.
+    :raises HmtSlamError: where the document is of another class or version, or malformed; names the field.
     """
     return decode_with_reset(text, kind)[0]
 
 
 def decode_with_reset(text: str, kind: type[Document]) -> tuple[Document, int]:
-    """The message of a JSON document, and the number of the request after which its sender had begun anew.
+    """The message of a JSON document, and the reset number of its sender.
 
     :raises HmtSlamError: as :func:`decode`.
     """
@@ -235,8 +218,8 @@ def decode_with_reset(text: str, kind: type[Document]) -> tuple[Document, int]:
     return _VALUES.read(content, kind, name), reset_number
 
 
-def _array_reader(field: str, kind: Hashable) -> Reader:  # noqa: ARG001  all are of one kind
-    """Arrays are poses (3,), but for the fields that are second moments (3, 3)."""
+def _array_reader(field: str, kind: Hashable) -> Reader:  # noqa: ARG001  all arrays have one type
+    """The reader of an array: a second moment, shape (3, 3), by its name, else a pose, shape (3,)."""
     shape = (3, 3) if field in ("covariance", "ambiguity") else (3,)
     wanted = f"an array of finite numbers of shape {shape}"
 

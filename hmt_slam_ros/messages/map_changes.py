@@ -1,4 +1,4 @@
-"""What messages say of the map: where its areas are, what joins them, and how it changes; immutable values."""
+"""Parts of messages that describe the map and its changes, as immutable values."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 
 Pose = NDArray[np.float64]
+"""Shape (3,): x, y, m, and heading, rad."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AreaPose:
-    """Where an area is in the globally consistent map.
+    """The pose of an area in the global map.
 
-    :ivar area: its id.
+    :ivar area: id of the area.
     :ivar pose: belief over ``map_T_area``.
     """
 
@@ -26,9 +27,9 @@ class AreaPose:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LocalArea:
-    """An area that the local map must hold.
+    """An area of the submap.
 
-    :ivar area: its id.
+    :ivar area: id of the area.
     :ivar pose: shape (3,), ``current_T_area``.
     """
 
@@ -38,9 +39,9 @@ class LocalArea:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class InitialPose:
-    """Where the robot is, as somebody says.
+    """A pose of the robot that a person gives.
 
-    :ivar area: a known area.
+    :ivar area: id of a known area.
     :ivar pose: belief over ``area_T_base``.
     """
 
@@ -55,7 +56,7 @@ class Arc:
     :ivar source: area a.
     :ivar target: area b.
     :ivar pose: belief over ``a_T_b``, Eq. (9).
-    :ivar closure: whether the arc closed a loop, that is, led into an area that was already known.
+    :ivar closure: whether the arc closed a loop, that is, leads into an area that was already known.
     """
 
     source: int
@@ -66,10 +67,10 @@ class Arc:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ArcEnds:
-    """Two areas between which an arc is taken out.
+    """The two areas of an arc that is removed.
 
-    :ivar source: the smaller.
-    :ivar target: the larger.
+    :ivar source: the smaller id.
+    :ivar target: the larger id.
     """
 
     source: int
@@ -78,11 +79,11 @@ class ArcEnds:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AreaMerge:
-    """Two areas that are one, with all keyframes and arcs.
+    """The merge of an area into another, with all keyframes and arcs.
 
-    :ivar area: the one that becomes part of the other.
-    :ivar into: the other.
-    :ivar pose: belief over ``into_T_area``, as the arc had it that joined the two.
+    :ivar area: the area that becomes part of the other.
+    :ivar into: the other area.
+    :ivar pose: belief over ``into_T_area``, that of the arc between the two.
     """
 
     area: int
@@ -92,11 +93,11 @@ class AreaMerge:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MovedKeyframe:
-    """A keyframe that is in another area now, or at another pose.
+    """A keyframe with a new area or pose.
 
-    :ivar keyframe: its number.
-    :ivar previous_area: the area in which it was.
-    :ivar area: the area to which it belongs now.
+    :ivar keyframe: number of the keyframe.
+    :ivar previous_area: area before the change.
+    :ivar area: area after the change.
     :ivar pose: shape (3,), ``area_T_base``.
     """
 
@@ -108,12 +109,12 @@ class MovedKeyframe:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StaleBeams:
-    """What a keyframe's scan says of the world that is not so any more.
+    """Beams of a keyframe's scan that newer scans refute.
 
-    :ivar keyframe: its number.
-    :ivar removed: numbers of the beams whose end is gone, ascending.
-    :ivar occluded: numbers of the beams in whose way something came to stand, ascending.
-    :ivar starts: from where on each of these still holds, m from the laser.
+    :ivar keyframe: number of the keyframe.
+    :ivar removed: numbers of the beams whose surface is gone, ascending.
+    :ivar occluded: numbers of the beams that a new surface blocks, ascending.
+    :ivar starts: distance from the laser from which each occluded beam is still valid, m.
     """
 
     keyframe: int
@@ -124,10 +125,10 @@ class StaleBeams:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PrunedKeyframe:
-    """A keyframe of ground that others hold as well.
+    """A redundant keyframe that is removed.
 
-    :ivar keyframe: its number.
-    :ivar area: the area in which it is.
+    :ivar keyframe: number of the keyframe.
+    :ivar area: area of the keyframe.
     """
 
     keyframe: int

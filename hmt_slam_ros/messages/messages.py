@@ -1,8 +1,8 @@
-"""What the processes say to each other, as immutable values.
+"""The messages between the processes, as immutable values.
 
-Scans and odometry enter as :class:`~hmt_slam_ros.sensors.Scan` and :class:`~hmt_slam_ros.sensors.Odometry`. One
-*keyframe event* k sets off the chain Keyframe(k) -> AreaEvents(k) -> Hypotheses(k) -> ClosureDecision(k), after which
-metric SLAM takes up the scans that waited.
+Scans and odometry are :class:`~hmt_slam_ros.sensors.Scan` and :class:`~hmt_slam_ros.sensors.Odometry`. A *keyframe
+event* k starts the chain Keyframe(k) -> AreaEvents(k) -> Hypotheses(k) -> ClosureDecision(k). After it metric SLAM
+processes the scans that waited.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ from hmt_slam_ros.sensors import Odometry, Scan
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HypothesisEstimate:
-    """What metric SLAM says of one live hypothesis at a keyframe event.
+    """The estimate of metric SLAM for a live hypothesis at a keyframe event.
 
     :ivar hypothesis: id of the live hypothesis.
     :ivar area: the robot's area, gamma_t.
     :ivar pose: belief over ``area_T_base`` at the keyframe. Its covariance is the drift since the area's origin, or
-        the uncertainty of localization where the robot moves over ground that is already mapped.
-    :ivar stored: whether the keyframe enters this hypothesis's map; False where it would add nothing new.
-    :ivar log_evidence: log-likelihood of the keyframe's scan where it is in the place that this hypothesis has it in,
-        relative to a place that looks alike; nats, not accumulated over keyframes.
-    :ivar log_kidnapping_ratio: by how much likelier the scan is where the robot was displaced before it, nats,
-        likewise.
-    :ivar clutter: what contradicts the hypothesis's map usually.
+        the uncertainty of localization on mapped ground.
+    :ivar stored: whether the keyframe is stored in the hypothesis's map; False where it is redundant.
+    :ivar log_evidence: log-likelihood ratio of the keyframe's scan at the pose of this hypothesis to a similar place,
+        nats, of this keyframe alone.
+    :ivar log_kidnapping_ratio: log-likelihood ratio of the scan for a kidnapping before it to none, nats, of this
+        keyframe alone.
+    :ivar clutter: usual rate of contradictions of the hypothesis's map.
     :ivar effective_samples: ESS of the hypothesis's particles, in [1, number of particles].
     :ivar revised_keyframes: earlier keyframes of the area whose pose changed because another particle leads now;
-        ``source`` and ``area`` are equal.
+        ``previous_area`` and ``area`` are equal.
     """
 
     hypothesis: int
@@ -71,10 +71,10 @@ class Keyframe:
     :ivar scan: the keyframe's scan.
     :ivar path_length: path length since the start, m.
     :ivar estimates: one estimate for every live hypothesis, ordered by hypothesis id.
-    :ivar motion_unknown: whether nothing tells how the robot came there from the keyframe before.
-    :ivar initial_pose: where that is as somebody says, None where nobody did.
-    :ivar mapping: whether the map may change; what a robot adds to it that may be anywhere changes nothing of it.
-    :ivar stale_beams: what the one hypothesis's map holds that is no more, as the last scans see it.
+    :ivar motion_unknown: whether the motion since the last keyframe is unknown.
+    :ivar initial_pose: initial pose of the robot, None where none was given.
+    :ivar mapping: whether the map may change. A lost robot may add to it even where it may not.
+    :ivar stale_beams: beams in the map of the only hypothesis that the last scans refute.
     """
 
     sequence: int
@@ -89,17 +89,17 @@ class Keyframe:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AreaEvent:
-    """The AAM's finding for one hypothesis.
+    """A change of the partition under one hypothesis.
 
     :ivar hypothesis: id of the live hypothesis.
-    :ivar kind: "cut" where the newest keyframes separate from the current area, "moved" where the robot went over a
-        known arc into a known area, "merged" where two areas that a definite arc joins are one.
-    :ivar keyframes: for "cut": the stored keyframes that leave, ascending, the newest among them; else empty.
+    :ivar kind: "cut" where the newest keyframes separate from the current area, "moved" where the robot passed a known
+        arc into a known area, "merged" where two areas with a definite arc become one.
+    :ivar keyframes: for "cut": the stored keyframes that separate, ascending, including the newest; else empty.
     :ivar area: for "moved": the known area in which the robot is now; for "cut": the area that was left; for "merged":
         the area that becomes part of ``into``.
     :ivar score: for "cut": the normalized cut; for "moved": the overlap with the new area; for "merged": the least
-        normalized cut of the two together.
-    :ivar into: for "merged": the area that stays, else None.
+        normalized cut of the joined graph.
+    :ivar into: for "merged": the area that remains, else None.
     """
 
     hypothesis: int
@@ -115,8 +115,8 @@ class AreaEvents:
     """aam -> tsbi, one for every keyframe event, mostly without events.
 
     :ivar sequence: the keyframe event that it answers.
-    :ivar events: of the hypotheses.
-    :ivar redundant_keyframes: keyframes that may be forgotten, where this is the map of one hypothesis alone.
+    :ivar events: changes under the hypotheses.
+    :ivar redundant_keyframes: keyframes that may be pruned, where there is one hypothesis.
     """
 
     sequence: int
@@ -126,24 +126,22 @@ class AreaEvents:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Hypothesis:
-    """A live hypothesis after keyframe event k, as changes against the leaf ``parent`` before it.
+    """A live hypothesis after keyframe event k, as changes against its parent before it.
 
-    :ivar id: its id; equal to ``parent`` where nothing branched; of several children of one parent each has a
-        new id.
-    :ivar parent: the hypothesis it continues.
+    :ivar id: id of the hypothesis: that of the parent where it is the only child, else a new one.
+    :ivar parent: id of the hypothesis that it continues.
     :ivar probability: P(gamma^t | d), Eq. (14).
     :ivar area: the robot's area now.
-    :ivar frame_change: belief over ``area_T_previous``: the frame of the robot's area before the event in that of
-        ``area``, as uncertain as the newest keyframe that came over is in the area, or as the arc; None where the area
-        did not change and the robot's pose stands.
-    :ivar moved_keyframes: keyframes that change area.
+    :ivar frame_change: belief over ``area_T_previous``, the pose of the robot's previous area in ``area``, with the
+        covariance of the newest keyframe that moved, or of the arc; None where area and pose are unchanged.
+    :ivar moved_keyframes: keyframes that change their area.
     :ivar arcs: arcs that are new or replaced.
-    :ivar local_areas: the areas of the local map, the current one first; empty where the local map stays as it is.
-    :ivar removed_arcs: arcs that this hypothesis does not believe any more.
-    :ivar area_merge: two areas that are one, where this is the only hypothesis; else None.
-    :ivar lost: whether the robot may be anywhere in the map, and maps around itself until it is recognized where.
-    :ivar tracking_reset: whether it is lost since now, and nothing was stored that it could map on from: it does from
-        the next scan on.
+    :ivar local_areas: areas of the submap, the robot's own first; empty where the submap is unchanged.
+    :ivar removed_arcs: arcs that are removed.
+    :ivar area_merge: merge of two areas, where this is the only hypothesis; else None.
+    :ivar lost: whether the hypothesis is lost: it maps around the robot until relocalization.
+    :ivar tracking_reset: whether it is lost from now on without a stored keyframe, so that mapping begins with the next
+        scan.
     """
 
     id: int
@@ -166,9 +164,9 @@ class Hypotheses:
 
     :ivar sequence: the keyframe event that it answers.
     :ivar hypotheses: every live hypothesis, ordered by id; probabilities sum to 1 less ``unexamined``.
-    :ivar unexamined: probability of topologies that the gate did not examine or the reduction dropped.
-    :ivar pruned_keyframes: keyframes that are no more, in any map, after all other changes.
-    :ivar stale_beams: beams that are left out of keyframes' scans from now on.
+    :ivar unexamined: probability of topologies that the gate excluded or the reduction dropped.
+    :ivar pruned_keyframes: keyframes that are removed from all maps, after all other changes.
+    :ivar stale_beams: beams that are removed from keyframes' scans.
     """
 
     sequence: int
@@ -183,17 +181,16 @@ class ClosureDecision:
     """tlca -> slam, aam, tsbi, rtl, recorder; one for every keyframe event.
 
     :ivar sequence: the keyframe event that it answers.
-    :ivar hypothesis: the hypothesis whose history is now definite, all others being dropped; None where the question
-        stays open.
+    :ivar hypothesis: the hypothesis that is now definite, all others being dropped; None where none is accepted.
     :ivar arcs: arcs of that hypothesis refined by alignment and fusion, Eq. (10).
-    :ivar moved_keyframes: keyframes of that hypothesis whose pose in their area was refined.
+    :ivar moved_keyframes: keyframes of that hypothesis with refined poses.
     :ivar global_poses: ``map_T_area`` of all areas of the most probable hypothesis, ordered by id; empty where
         unchanged since the last message.
-    :ivar revised_hypotheses: where accepted closures contradict each other, the explanations of that, the most probable
-        first: the children into which TSBI branches the hypothesis at the next event, with ids of its own and their
-        local maps. Each child withdraws what its explanation takes for false. Else empty.
-    :ivar ambiguity: shape (3, 3), the second moment of the robot's pose under the other live hypotheses about that
-        under the most probable one: x, y along the axes of the map, m, and heading, rad; 0 where there is no other.
+    :ivar revised_hypotheses: explanations of a contradiction between accepted closures, the most probable first. TSBI
+        branches the hypothesis into these children at the next event, with new ids and submaps. Each child withdraws
+        the closures that its explanation declares false. Else empty.
+    :ivar ambiguity: shape (3, 3), second moment of the robot's pose under the other hypotheses about that under the
+        most probable one: x, y along the axes of the map, m, and heading, rad; 0 for a single hypothesis.
     """
 
     sequence: int
@@ -209,12 +206,12 @@ class ClosureDecision:
 class LocalEstimate:
     """slam -> rtl, recorder, and to the robot as the acknowledgement of a scan; one for every scan.
 
-    :ivar stamp: the scan's, ns.
-    :ivar scan_index: 0, 1, 2, ... of the scan since the start, without gaps.
+    :ivar stamp: stamp of the scan, ns.
+    :ivar scan_index: number of the scan since the start, 0, 1, 2, ... without gaps.
     :ivar area: area of the most probable hypothesis.
     :ivar pose: belief over ``area_T_base`` at the scan, the HMT pose s_t = (gamma_t, x_t).
     :ivar odometry: shape (3,), ``odom_T_base`` at the scan.
-    :ivar dropped: scans dropped since the start.
+    :ivar dropped: number of scans dropped since the start.
     """
 
     stamp: int
@@ -227,7 +224,7 @@ class LocalEstimate:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ScanPoses:
-    """slam -> tlca, recorder: where the scans since the last trail were taken, under one hypothesis.
+    """slam -> tlca, recorder: poses of the scans since the last message, under one hypothesis.
 
     :ivar hypothesis: id of the live hypothesis.
     :ivar first_scan: ``scan_index`` of the first row.
@@ -245,15 +242,15 @@ class ScanPoses:
 
 @dataclass(frozen=True, eq=False)
 class RealTimePose:
-    """rtl -> the robot's other programs; one for every odometry reading.
+    """rtl -> other programs; one for every odometry reading.
 
-    :ivar stamp: of the odometry reading, ns.
+    :ivar stamp: stamp of the odometry reading, ns.
     :ivar area: area gamma of the pose.
     :ivar area_pose: belief over ``map_T_area``.
     :ivar estimate: belief over ``area_T_base`` at the last estimate.
     :ivar motion: belief over the motion of the base since then, from the odometry.
-    :ivar odometry: the reading, ``odom_T_base``, shape (3,).
-    :ivar ambiguity: of the newest ``ClosureDecision``, shape (3, 3).
+    :ivar odometry: ``odom_T_base`` of the reading, shape (3,).
+    :ivar ambiguity: ambiguity of the newest ``ClosureDecision``, shape (3, 3).
     """
 
     stamp: int
@@ -264,7 +261,7 @@ class RealTimePose:
     odometry: Pose
     ambiguity: NDArray[np.float64]
 
-    # In an offline run nobody asks for the poses, and they take longer than all else that rtl does.
+    # Computed on demand: an offline run needs none of these poses, and they take most of the time of rtl.
     @cached_property
     def pose_in_area(self) -> PoseGaussian:
         """Belief over ``area_T_base``, p(s_t+k | s_t, u), the HMT pose by dead reckoning from the last estimate."""
@@ -279,16 +276,16 @@ class RealTimePose:
 
     @property
     def map_T_odom(self) -> Pose:  # noqa: N802  named as every transform is
-        """What takes the odometry's pose to the map, shape (3,)."""
+        """The transform from the odometry frame to the map, shape (3,)."""
         return se2.compose(self.map_pose.mean, se2.inverse(self.odometry))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseReset:
-    """robot -> slam: the next scan may be from anywhere, at any time; odometry begins anew.
+    """robot -> slam: reset the pose estimate before the next scan, with new odometry.
 
-    :ivar initial_pose: where it is as somebody says, None where nobody knows. A robot that may be anywhere was not
-        carried then: that its place was not known is why it is said.
+    :ivar initial_pose: initial pose, None for global localization. A lost robot that gets an initial pose was not
+        kidnapped.
     """
 
     initial_pose: InitialPose | None = None
@@ -296,10 +293,10 @@ class PoseReset:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TrackingReset:
-    """slam -> tsbi, rtl, robot: where the robot is, and when, is not known from here on.
+    """slam -> tsbi, rtl, robot: the robot's pose and the time are unknown from here on.
 
-    :ivar event: the keyframe event with which it arrives, which is the next one.
-    :ivar scans_before: scans before it; what slam says of these is past.
+    :ivar event: the keyframe event that follows, which is the next one.
+    :ivar scans_before: number of scans before the reset; estimates for these are obsolete.
     """
 
     event: int
@@ -308,16 +305,16 @@ class TrackingReset:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class EndOfLog:
-    """robot -> slam: no more scans will come; slam answers with the last trails and ``EndOfRun``."""
+    """robot -> slam: no more scans follow; slam answers with the last ``ScanPoses`` and ``EndOfRun``."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class EndOfRun:
-    """slam -> recorder, robot: every scan received has been processed.
+    """slam -> recorder, robot: all scans are processed.
 
-    :ivar received: scans received.
-    :ivar processed: scans for which a pose was given.
-    :ivar dropped: scans refused or skipped.
+    :ivar received: number of scans received.
+    :ivar processed: number of scans with a pose.
+    :ivar dropped: number of scans refused or skipped.
     """
 
     received: int
@@ -327,9 +324,9 @@ class EndOfRun:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Notice:
-    """Any process -> the log and the report: something a person should know; said once per cause.
+    """Any process -> the log and the report: a sentence for people, sent once for each cause.
 
-    :ivar process: who says it.
+    :ivar process: name of the process.
     :ivar text: one sentence that names the value and the remedy.
     """
 

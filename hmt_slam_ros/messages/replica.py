@@ -1,4 +1,4 @@
-"""The maps of all live hypotheses, kept up to date in every process from the messages that it hears."""
+"""The replica: the maps of all live hypotheses, which each process updates from the messages of the chain."""
 
 from __future__ import annotations
 
@@ -15,17 +15,20 @@ from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.scan import BeamRevision
 
 FIRST_HYPOTHESIS = 0
+"""Id of the only hypothesis at the start."""
+
 FIRST_AREA = 0
+"""Id of the only area at the start."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReplicaState:
-    """The maps of all live hypotheses, at first one in which nothing is known.
+    """The maps of all live hypotheses, by default one empty map.
 
     :ivar scans: {keyframe: scan}.
-    :ivar common: the areas and arcs that all hypotheses agree on.
-    :ivar max_area_id: the largest area that there ever was among these, -1 where there was none.
-    :ivar changes: {hypothesis: the areas in which it differs from ``common``, whole, and likewise the arcs}.
+    :ivar common: areas and arcs of the common map.
+    :ivar max_area_id: largest id of an area that was ever in the common map, -1 for none.
+    :ivar changes: {hypothesis: areas and arcs that differ from ``common``}.
     :ivar probabilities: {hypothesis: P(gamma^t | d)}.
     :ivar robot_areas: {hypothesis: the robot's area}.
     """
@@ -46,7 +49,7 @@ class Replica:
     :ivar maps: {hypothesis: map}.
     :ivar probabilities: {hypothesis: P(gamma^t | d)}.
     :ivar robot_areas: {hypothesis: the robot's area}.
-    :ivar contested: keyframes stored while there were several hypotheses, of which it may be that only some did.
+    :ivar contested: keyframes that were stored while there were several hypotheses, perhaps under some of them only.
     """
 
     scans: dict[int, Scan] = field(default_factory=dict)
@@ -65,22 +68,24 @@ class Replica:
             assert arc is not None
             common.set_arc(pair, arc)
         common.max_area_id = state.max_area_id
-        maps = {h: HybridMap(common, own.area_keyframes(), own.arc_values()) for h, own in state.changes.items()}
-        agreed = {keyframe for keyframes in common.areas.values() for keyframe in keyframes}
-        contested = state.scans.keys() - agreed
+        maps = {
+            h: HybridMap(common, change.area_keyframes(), change.arc_values()) for h, change in state.changes.items()
+        }
+        definite = {keyframe for keyframes in common.areas.values() for keyframe in keyframes}
+        contested = state.scans.keys() - definite
         return cls(dict(state.scans), maps, dict(state.probabilities), dict(state.robot_areas), contested)
 
     @property
     def state(self) -> ReplicaState:
-        """All of it as a value."""
+        """The replica as a value."""
         common = next(iter(self.maps.values())).common
         return ReplicaState(
             dict(self.scans),
             GraphState.from_areas_and_arcs(common.areas, common.arcs),
             common.max_area_id,
             {
-                hypothesis: GraphState.from_areas_and_arcs(own.changed_areas, own.changed_arcs)
-                for hypothesis, own in self.maps.items()
+                hypothesis: GraphState.from_areas_and_arcs(hybrid_map.changed_areas, hybrid_map.changed_arcs)
+                for hypothesis, hybrid_map in self.maps.items()
             },
             dict(self.probabilities),
             dict(self.robot_areas),
@@ -88,11 +93,11 @@ class Replica:
 
     @property
     def best_hypothesis(self) -> int:
-        """The most probable hypothesis; of equals the oldest."""
+        """The most probable hypothesis; of equal ones the oldest."""
         return min(self.probabilities, key=lambda h: (-self.probabilities[h], h))
 
     def apply_message(self, message: Keyframe | Hypotheses | ClosureDecision) -> None:
-        """Take in a message of the chain, for one who has no decision in it."""
+        """Apply a message of the chain."""
         match message:
             case Keyframe():
                 self.add_keyframe(message)
@@ -102,53 +107,55 @@ class Replica:
                 self.apply_decision(message)
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
-        """Store a keyframe in the maps of the hypotheses that want it."""
-        for leaf in keyframe.estimates:
-            if leaf.hypothesis in self.maps:
-                self.apply_changes(self.maps[leaf.hypothesis], leaf.revised_keyframes)
-            if leaf.stored and leaf.hypothesis in self.maps:
-                self.maps[leaf.hypothesis].set_keyframe(keyframe.sequence, leaf.area, leaf.pose.mean)
+        """Store a keyframe in the maps of the hypotheses under which it is stored."""
+        for estimate in keyframe.estimates:
+            hybrid_map = self.maps.get(estimate.hypothesis)
+            if hybrid_map is None:
+                continue
+            self.apply_changes(hybrid_map, estimate.revised_keyframes)
+            if estimate.stored:
+                hybrid_map.set_keyframe(keyframe.sequence, estimate.area, estimate.pose.mean)
                 self.scans[keyframe.sequence] = keyframe.scan
                 if len(self.maps) > 1:
                     self.contested.add(keyframe.sequence)
 
     def apply_hypotheses(self, hypotheses: Hypotheses) -> None:
-        """Branch, change and drop hypotheses as TSBI decided."""
-        self.maps = {leaf.id: self._child_map(leaf) for leaf in hypotheses.hypotheses}
-        self.probabilities = {leaf.id: leaf.probability for leaf in hypotheses.hypotheses}
-        self.robot_areas = {leaf.id: leaf.area for leaf in hypotheses.hypotheses}
-        for late in hypotheses.stale_beams:
-            if late.keyframe in self.scans:
-                revision = BeamRevision(late.removed, late.occluded, late.starts)
-                self.scans[late.keyframe] = self.scans[late.keyframe].revise(revision)
-        for one in hypotheses.pruned_keyframes:
+        """Branch, change and drop hypotheses, revise scans and prune keyframes."""
+        self.maps = {h.id: self._child_map(h) for h in hypotheses.hypotheses}
+        self.probabilities = {h.id: h.probability for h in hypotheses.hypotheses}
+        self.robot_areas = {h.id: h.area for h in hypotheses.hypotheses}
+        for stale in hypotheses.stale_beams:
+            if stale.keyframe in self.scans:
+                revision = BeamRevision(stale.removed, stale.occluded, stale.starts)
+                self.scans[stale.keyframe] = self.scans[stale.keyframe].revise(revision)
+        for pruned in hypotheses.pruned_keyframes:
             for hybrid_map in self.maps.values():
-                hybrid_map.remove_keyframe(one.keyframe, one.area)
-            del self.scans[one.keyframe]
-            self.contested.discard(one.keyframe)
+                hybrid_map.remove_keyframe(pruned.keyframe, pruned.area)
+            del self.scans[pruned.keyframe]
+            self.contested.discard(pruned.keyframe)
 
-    def _child_map(self, leaf: Hypothesis) -> HybridMap:
-        parent = self.maps[leaf.parent]
-        child = parent if leaf.id == leaf.parent else parent.branch()
-        self.apply_changes(child, leaf.moved_keyframes, leaf.arcs, leaf.removed_arcs)
-        if leaf.area_merge is not None:
-            child.merge(leaf.area_merge.area, leaf.area_merge.into, leaf.area_merge.pose)
+    def _child_map(self, hypothesis: Hypothesis) -> HybridMap:
+        parent, merge = self.maps[hypothesis.parent], hypothesis.area_merge
+        child = parent if hypothesis.id == hypothesis.parent else parent.branch()
+        self.apply_changes(child, hypothesis.moved_keyframes, hypothesis.arcs, hypothesis.removed_arcs)
+        if merge is not None:
+            child.merge(merge.area, merge.into, merge.pose)
         return child
 
-    def apply_decision(self, accepted: ClosureDecision) -> None:
-        """Make one hypothesis definite and drop the others."""
-        if accepted.hypothesis is None:
+    def apply_decision(self, decision: ClosureDecision) -> None:
+        """Make the accepted hypothesis definite and drop the others, where there is one."""
+        if decision.hypothesis is None:
             return
-        chosen = self.maps[accepted.hypothesis]
-        self.apply_changes(chosen, accepted.moved_keyframes, accepted.arcs)
+        chosen = self.maps[decision.hypothesis]
+        self.apply_changes(chosen, decision.moved_keyframes, decision.arcs)
         chosen.commit()
         self._drop_contested(chosen)
-        self.maps = {accepted.hypothesis: chosen}
-        self.probabilities = {accepted.hypothesis: 1.0}
-        self.robot_areas = {accepted.hypothesis: self.robot_areas[accepted.hypothesis]}
+        self.maps = {decision.hypothesis: chosen}
+        self.probabilities = {decision.hypothesis: 1.0}
+        self.robot_areas = {decision.hypothesis: self.robot_areas[decision.hypothesis]}
 
     def _drop_contested(self, hybrid_map: HybridMap) -> None:
-        """Forget the scans that were stored under hypotheses that are no more, when the map of one is left."""
+        """Drop the scans that are not in the map of the remaining hypothesis."""
         for keyframe in self.contested:
             if not any(keyframe in keyframes for keyframes in hybrid_map.common.areas.values()):
                 del self.scans[keyframe]
@@ -157,38 +164,38 @@ class Replica:
     @staticmethod
     def apply_changes(
         hybrid_map: HybridMap,
-        relabelled: tuple[MovedKeyframe, ...],
+        moved_keyframes: tuple[MovedKeyframe, ...],
         arcs: tuple[Arc, ...] = (),
-        withdrawn: tuple[ArcEnds, ...] = (),
+        removed_arcs: tuple[ArcEnds, ...] = (),
     ) -> None:
-        """Move keyframes, take arcs out and set arcs, as a message says."""
-        for r in relabelled:
-            if r.previous_area != r.area:
-                hybrid_map.remove_keyframe(r.keyframe, r.previous_area)
-            hybrid_map.set_keyframe(r.keyframe, r.area, r.pose)
-        for ends in withdrawn:
+        """Move keyframes, remove arcs and set arcs of a map."""
+        for moved in moved_keyframes:
+            if moved.previous_area != moved.area:
+                hybrid_map.remove_keyframe(moved.keyframe, moved.previous_area)
+            hybrid_map.set_keyframe(moved.keyframe, moved.area, moved.pose)
+        for ends in removed_arcs:
             hybrid_map.remove_arc(ends.source, ends.target)
         for arc in arcs:
             hybrid_map.set_arc(arc.source, arc.target, arc.pose, closure=arc.closure)
 
 
 class GlobalPoses(Mapping[int, PoseGaussian]):
-    """{area: belief over ``map_T_area``}; taking over a message costs the same however many areas it has."""
+    """{area: belief over ``map_T_area``}, a view of a message that takes constant time to make."""
 
     def __init__(self, areas: Sequence[AreaPose] = ()) -> None:
-        """:param areas: ordered by id, as ``ClosureDecision.global_poses`` is."""
+        """:param areas: poses ordered by id, as in ``ClosureDecision.global_poses``."""
         self._areas = areas
 
     @property
     def areas(self) -> tuple[AreaPose, ...]:
-        """All of them, ordered by id."""
+        """The poses, ordered by id."""
         return tuple(self._areas)
 
     def __getitem__(self, area: int) -> PoseGaussian:
-        place = bisect_left(self._areas, area, key=attrgetter("area"))
-        if place == len(self._areas) or self._areas[place].area != area:
+        row = bisect_left(self._areas, area, key=attrgetter("area"))
+        if row == len(self._areas) or self._areas[row].area != area:
             raise KeyError(area)
-        return self._areas[place].pose
+        return self._areas[row].pose
 
     def __iter__(self) -> Iterator[int]:
         return (entry.area for entry in self._areas)

@@ -1,4 +1,4 @@
-"""Who hears what: the same for the lock-step run and for the nodes."""
+"""The interface of processes and their subscriptions, the same for both runtimes."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from hmt_slam_ros.process_table import COMPANIONS, PROCESSES, RECORDER, resolve_
 
 
 class Process(Protocol):
-    """A value machine: no thread, clock, file or global random state inside."""
+    """A value machine, without threads, clocks, files and global random state."""
 
     def handle(self, message: Message) -> list[Message]:
-        """Take in one message and return what there is to say."""
+        """Process a message and return the messages that answer it."""
 
 
 class Checkpointable(Process, Protocol):
-    """A process whose memory is a value, from which another one can go on."""
+    """A process whose state is a value, from which another process can continue."""
 
     @property
     def state(self) -> object:
-        """All that it knows between two messages, or between two keyframe events."""
+        """The whole state between two messages, or between two keyframe events."""
 
 
 _KINDS = {kind.__name__: kind for kind in get_args(Message)}
 
 
 def message_types(names: Iterable[str]) -> tuple[type, ...]:
-    """Classes of messages.
+    """The message classes of some names.
 
-    :param names: of members of ``Message``, or "module:Class".
+    :param names: names of members of ``Message``, or "module:Class".
     """
     return tuple(resolve_class(name) if ":" in name else _KINDS[name] for name in names)
 

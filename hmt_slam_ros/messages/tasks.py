@@ -1,4 +1,4 @@
-"""What is said to explorer and pilot, who drive the robot, and what they say."""
+"""The messages of explorer and pilot, which drive the robot."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ PILOT_TASKS: tuple[TaskKind, ...] = ("localize", "stop", "go")
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """to explorer or pilot: what to do from now on.
+    """To explorer or pilot: what to do from now on.
 
     :ivar kind: "explore" until the building is known, "go" to a place, "backtrack" along the robot's own path until
-        told otherwise, "localize" the robot, "stop".
+        the next task, "localize" the robot, "stop".
     :ivar place: name of the place to go to, such as "room 3" or "area 12".
     """
 
@@ -34,10 +34,10 @@ class Task:
 
 
 def parse_task(text: str, kinds: Sequence[TaskKind]) -> Task:
-    """The task that is written as its kind and, where it has one, the name of the place.
+    """The task of a text: its kind, and for "go" the name of a place.
 
-    :param kinds: those that there are.
-    :raises HmtSlamError: for anything else.
+    :param kinds: tasks that are allowed.
+    :raises HmtSlamError: where the text is no allowed task.
     """
     word, _, place = text.strip().partition(" ")
     for kind in kinds:
@@ -49,11 +49,11 @@ def parse_task(text: str, kinds: Sequence[TaskKind]) -> Task:
 
 @dataclass(frozen=True, slots=True)
 class TaskResult:
-    """explorer or pilot -> who gave the task: how it ended.
+    """Explorer or pilot -> sender of the task: how the task ended.
 
-    :ivar task: which.
-    :ivar succeeded: whether all was done that was to be done.
-    :ivar reason: in a few words.
+    :ivar task: the task.
+    :ivar succeeded: whether the task is complete.
+    :ivar reason: the reason of its end, in a few words.
     """
 
     task: Task
@@ -62,15 +62,15 @@ class TaskResult:
 
     @property
     def text(self) -> str:
-        """One sentence."""
+        """The result as one sentence."""
         return f"{self.task.kind} {self.task.place}".strip() + f": {self.reason}"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class GoalPose:
-    """explorer or pilot -> who drives in its stead, or looks on: where the robot is to go now; one for every new goal.
+    """Explorer or pilot -> navigation, or displays: the current goal; one message for every new goal.
 
-    :ivar stamp: of the newest scan when it was chosen, ns.
+    :ivar stamp: stamp of the newest scan when the goal was chosen, ns.
     :ivar area: area of the goal.
     :ivar pose: shape (3,), ``area_T_goal``, m and rad.
     """
@@ -82,11 +82,11 @@ class GoalPose:
 
 @dataclass(frozen=True, slots=True)
 class VelocityCommand:
-    """explorer or pilot -> robot: the velocities until the next scan; one for every scan, of the pilot amid a task.
+    """Explorer or pilot -> robot: the velocities until the next scan; one for every scan, of the pilot during a task.
 
-    :ivar stamp: of the scan, ns.
-    :ivar speed: m/s.
-    :ivar turn_rate: rad/s, to the left.
+    :ivar stamp: stamp of the scan, ns.
+    :ivar speed: forward velocity, m/s.
+    :ivar turn_rate: angular velocity, counterclockwise, rad/s.
     """
 
     stamp: int
@@ -96,16 +96,16 @@ class VelocityCommand:
 
 @dataclass(frozen=True, slots=True)
 class PlaceEstimate:
-    """pilot -> people and other programs: the belief over places, Eq. (1) of Tomatis et al. (2003); one for every scan.
+    """Pilot -> other programs: the belief over places, Eq. (1) of Tomatis et al. (2003); one for every scan.
 
-    :ivar stamp: of the scan, ns.
-    :ivar place: name of the most probable place, at which the robot was last, None for unknown ground.
-    :ivar heading: the direction in which it looks, "north", "east", "south" or "west", None likewise.
-    :ivar distance_past_node: how far it is beyond the place, m.
-    :ivar probability: of the place with the direction of travel, or of unknown ground.
-    :ivar entropy: of the belief, Eq. (3), nats.
-    :ivar confident: whether that is below `places.max_entropy`.
-    :ivar room: name of the room behind the place in which the metric filter has it, None where that is not asked.
+    :ivar stamp: stamp of the scan, ns.
+    :ivar place: name of the most probable place, the last that the robot passed; None for unmapped ground.
+    :ivar heading: direction of travel, "north", "east", "south" or "west"; None for unmapped ground.
+    :ivar distance_past_node: distance of the robot beyond the place, m.
+    :ivar probability: probability of the place with that direction, or of unmapped ground.
+    :ivar entropy: entropy of the belief, Eq. (3), nats.
+    :ivar confident: whether the entropy is below `places.max_entropy`.
+    :ivar room: name of the room behind the place that holds the metric pose; None where the pose is in no room.
     """
 
     stamp: int

@@ -1,1 +1,1 @@
-"""All processes in lock-step in one process, and the output folder."""
+"""The lock-step runtime: all processes in one program."""

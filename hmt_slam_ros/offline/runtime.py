@@ -1,4 +1,4 @@
-"""All processes in lock-step in one process: every message is delivered in the order in which it was said."""
+"""The lock-step runtime: all processes in one program, with messages delivered in the order of sending."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from hmt_slam_ros.sensors import Scan
 class LockStep:
     """A deterministic scheduler.
 
-    :ivar processes: {name: process}, of those named in ``SUBSCRIPTIONS``.
-    :ivar seconds: {name: seconds spent since the last call of :meth:`take_seconds`}.
+    :ivar processes: {name in ``SUBSCRIPTIONS``: process}.
+    :ivar seconds: {name: computing time since the last call of :meth:`take_seconds`, s}.
     """
 
     processes: Mapping[str, Process]
@@ -36,7 +36,7 @@ class LockStep:
     _subscribers: dict[type, list[tuple[str, Process]]] = field(default_factory=dict)
 
     def feed(self, message: Message) -> None:
-        """Deliver a message and everything that is said because of it."""
+        """Deliver a message and all messages that it causes."""
         pending: deque[Message] = deque([message])
         while pending:
             current = pending.popleft()
@@ -53,19 +53,19 @@ class LockStep:
         return self._subscribers[kind]
 
     def take_seconds(self) -> dict[str, float]:
-        """Seconds that each process spent since the last call."""
+        """The computing time of each process since the last call, s."""
         taken, self.seconds = self.seconds, {}
         return taken
 
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """What a run leaves.
+    """The result of a run.
 
-    :ivar recorder: what was said.
-    :ivar log_progress: which scans were read.
-    :ivar seconds_per_scan: {process: shape (m,) seconds}, of the scans that this run read.
-    :ivar map_bytes: what the maps of all particles took at most.
+    :ivar recorder: recorder of the messages.
+    :ivar log_progress: progress through the logs.
+    :ivar seconds_per_scan: {process: shape (m,), computing time for each scan of this run, s}.
+    :ivar map_bytes: peak memory of the maps of all particles, bytes.
     """
 
     recorder: Recorder
@@ -75,10 +75,10 @@ class RunResult:
 
 
 class LockStepRun:
-    """All processes and the recorder in lock-step, from the start or from a state on.
+    """A run of all processes and the recorder in lock-step.
 
-    :ivar lock_step: that runs them.
-    :ivar recorder: that listens.
+    :ivar lock_step: scheduler of the processes.
+    :ivar recorder: recorder of the messages.
     """
 
     def __init__(
@@ -88,10 +88,10 @@ class LockStepRun:
         state: RunState | None = None,
         observers: Mapping[str, Process] | None = None,
     ) -> None:
-        """:param abstraction: what makes areas of keyframes instead of the AAM, such as nothing.
+        """:param abstraction: makes the process that replaces the AAM.
 
-        :param state: to go on from.
-        :param observers: {name: process}, which listen as well.
+        :param state: state from which the run continues.
+        :param observers: {name: process}, additional processes that receive messages.
         """
         state = state or RunState()
         self._processes: dict[str, Checkpointable] = {
@@ -105,18 +105,18 @@ class LockStepRun:
 
     @property
     def scans_read(self) -> int:
-        """Scans of the newest log that were read."""
+        """Number of scans read of the newest log."""
         return self._log_reader.scans_read
 
     @property
     def recorded_bytes(self) -> int:
-        """What is kept of every scan for the output: where it was taken, its stamps, and what it cost."""
-        costs = sum(len(spent) * spent.itemsize for spent in self._seconds_per_scan.values())
+        """Memory of the poses, stamps and costs of all scans, bytes."""
+        costs = sum(len(seconds) * seconds.itemsize for seconds in self._seconds_per_scan.values())
         return costs + self._log_reader.stamp_bytes + self.recorder.earlier_record.table_bytes
 
     @property
     def state(self) -> RunState:
-        """All that is known, between two records of the log."""
+        """The state between two records of the log."""
         return RunState(
             self._log_reader.state,
             {name: process.state for name, process in self._processes.items()},
@@ -124,11 +124,9 @@ class LockStepRun:
         )
 
     def unread_records(self, log: Log) -> Iterator[LogRecord]:
-        """The records of a log that were not read.
+        """The unread records of a log. A further log begins with a reset of the robot's pose.
 
-        Where it is a further one, the robot may be anywhere, at any time.
-
-        :raises HmtSlamError: where it is not as it was when the others were read.
+        :raises HmtSlamError: where the records that were read differ from those of the log.
         """
         if not is_newest_log(self._log_reader.state, log):
             self.lock_step.feed(EndOfLog())
@@ -137,20 +135,20 @@ class LockStepRun:
         return self._log_reader.unread_records(log)
 
     def process_record(self, record: LogRecord) -> None:
-        """Take in a record."""
+        """Process a record."""
         self.lock_step.feed(record.measurement)
         self._log_reader.mark_read(record)
         if isinstance(record.measurement, Scan):
-            taken = self.lock_step.take_seconds()
-            for name, spent in self._seconds_per_scan.items():
-                spent.append(taken.get(name, 0.0))
+            spent = self.lock_step.take_seconds()
+            for name, seconds in self._seconds_per_scan.items():
+                seconds.append(spent.get(name, 0.0))
 
     def finish(self) -> RunResult:
-        """End the run."""
+        """End the run and return its result."""
         self.lock_step.feed(EndOfLog())
         slam = self._processes[COORDINATOR]
         assert isinstance(slam, MetricSlam)
-        seconds = {name: np.array(spent) for name, spent in self._seconds_per_scan.items()}
+        seconds = {name: np.array(values) for name, values in self._seconds_per_scan.items()}
         return RunResult(self.recorder, self._log_reader.state, seconds, slam.peak_map_bytes)
 
 
@@ -165,13 +163,12 @@ def run_log(
 ) -> RunResult:
     """Map a whole log.
 
-    :param log: the newest of the state's logs, or a further one.
-    :param progress: called with the number of scans read, after each.
-    :param abstraction: what makes areas of keyframes instead of the AAM, such as nothing.
-    :param state: to go on from, at the first record that it does not know.
-    :param on_state: called with the state after the last record, before the end of the log is told.
-    :param compact_record: whether the recorder keeps a record of what was said, and not the messages, so that a run may
-        last.
+    :param log: the newest log of the state, or a further one.
+    :param progress: called with the number of scans read, after each scan.
+    :param abstraction: makes the process that replaces the AAM.
+    :param state: state from which the run continues, with the first record that was not read.
+    :param on_state: called with the state after the last record, before ``EndOfLog``.
+    :param compact_record: whether the recorder replaces messages by a record, which saves memory in long runs.
     :raises HmtSlamError: where the log is faulty.
     """
     run = LockStepRun(configuration, abstraction, state)

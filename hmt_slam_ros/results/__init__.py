@@ -1,1 +1,1 @@
-"""What a run leaves: trajectories, map, report and pictures, whichever runtime it ran in."""
+"""The results of a run in either runtime: trajectories, map, report and pictures."""

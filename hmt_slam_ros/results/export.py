@@ -1,4 +1,4 @@
-"""Parts of a saved map for other programs: its grid, its topology as GraphML, its chart of places as JSON."""
+"""Parts of a saved map for other programs: grid for nav2, topology as GraphML, chart of places as JSON."""
 
 from __future__ import annotations
 
@@ -25,20 +25,28 @@ from hmt_slam_ros.results.hmt_map import read_saved_map
 from hmt_slam_ros.results.log_reading import map_folder
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
-_FINEST, _COARSEST = 0.005, 10.0  # m
+_FINEST, _COARSEST = 0.005, 10.0
+"""Limits of the resolution of a grid, m."""
+
+PLACES, TOPOLOGY, LANDMARKS = "places.json", "topology.graphml", "landmarks.json"
+"""Files of the chart of places, of the topology and of the landmarks."""
+
+_POSE = ("x", "y", "theta")
+_COVARIANCE = ("xx", "xy", "xt", "yy", "yt", "tt")
+"""Names of the components of a pose, and of the upper triangle of its covariance."""
 
 
 def export_grid(
     directory: Path, folder: Path, resolution: float | None = None, area: int | None = None
 ) -> tuple[Path, Path]:
-    """Draw the keyframes of the most probable hypothesis anew, as map.pgm and map.yaml.
+    """Write map.pgm and map.yaml, drawn from the keyframes of the most probable hypothesis.
 
-    :param directory: output folder, or the hmt_map in it or of nodes.
-    :param folder: folder, made where it is missing.
+    :param directory: output folder, the hmt_map in it, or a map that nodes saved.
+    :param folder: folder for the files, made where it is missing.
     :param resolution: side of a cell, m; that of the local maps where None.
-    :param area: one area alone, in the frame of that area; the whole map in its own frame where None.
+    :param area: the one area to draw, in its own frame; None for the whole map in the map frame.
     :returns: the two files.
-    :raises HmtSlamError: where the folder holds no complete map, no such area, or the resolution is none.
+    :raises HmtSlamError: where there is no complete map, no such area, or the resolution is out of range.
     """
     if resolution is not None and not _FINEST <= resolution <= _COARSEST:
         raise HmtSlamError(f"--resolution {resolution:g} is none for a grid: give {_FINEST:g} to {_COARSEST:g} m")
@@ -48,34 +56,30 @@ def export_grid(
     if area is not None and area not in areas:
         raise HmtSlamError(f"--area {area} is not in the map: its areas are {', '.join(map(str, areas))}")
     frames = {area: np.zeros(3)} if area is not None else {known: saved.area_poses[known].mean for known in areas}
-    placed = {
+    poses = {
         keyframe: se2.compose(frame, pose)
         for known, frame in frames.items()
         for keyframe, pose in hybrid_map.keyframes(known).items()
     }
-    scans = [saved.replica.scans[keyframe] for keyframe in placed]
+    scans = [saved.replica.scans[keyframe] for keyframe in poses]
     settings = saved.configuration.local_map
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        image = occupancy_image(scans, np.array(list(placed.values())), resolution or settings.cell, settings.max_range)
+        image = occupancy_image(scans, np.array(list(poses.values())), resolution or settings.cell, settings.max_range)
         write_map(folder, image)
     except OSError as fault:
         raise HmtSlamError(f"{folder} cannot be written ({fault.strerror}): choose another --grid") from fault
     return folder / "map.pgm", folder / "map.yaml"
 
 
-PLACES = "places.json"
-
-
 def write_places(directory: Path, area_poses: Mapping[int, PoseGaussian], chart: Chart) -> Path:
     """Write ``places.json``, with all numbers in m and rad.
 
-    ``places``, in order, are doors, crossings and ends of hallways, each with its ``name``, the ``area`` in whose frame
-    it is known, ``area_T_place`` and ``map_T_place`` (x, y, theta), heading north, the ``existence``, and the
-    ``openings`` that lead off there with their ``direction`` and ``width``. ``ways`` lead from one place to the next,
-    by their numbers, in both directions: ``distance`` and ``deviation``, and the ``landmarks`` on the way in the order
-    in which they are met, each so far ``along`` it, on its ``track``, with a ``form`` (a corner's heading against the
-    way, an opening's width) and its ``existence``.
+    ``places`` are doors, crossings and ends of hallways. Each has its ``name``, its ``area``, ``area_T_place`` and
+    ``map_T_place`` (x, y, theta) with the heading north, its ``existence``, and its ``openings`` with ``direction`` and
+    ``width``. ``ways`` connect neighboring places, by their numbers, in both directions. Each has ``distance``,
+    ``deviation`` and the ``landmarks`` along it in order, with the distance ``along`` it, the ``track``, a ``form`` (a
+    corner's heading relative to the way, an opening's width) and the ``existence``.
 
     :param area_poses: {area: the belief over ``map_T_area``}.
     """
@@ -89,8 +93,8 @@ def write_places(directory: Path, area_poses: Mapping[int, PoseGaussian], chart:
 
 def _place_entry(name: str, frame: PoseGaussian, node: ChartNode) -> dict[str, object]:
     openings = [
-        {"direction": DIRECTION_NAMES[one.direction], "width": one.landmark.width, "hallway": one.leads_to_hallway}
-        for one in node.openings
+        {"direction": DIRECTION_NAMES[side.direction], "width": side.landmark.width, "hallway": side.leads_to_hallway}
+        for side in node.openings
     ]
     return {
         "name": name,
@@ -115,7 +119,7 @@ def _edge_entry(edge: Edge) -> dict[str, object]:
 
 
 def _edge_landmark_entries(landmarks: LandmarkSequence) -> list[dict[str, object]]:
-    """In the order in which they are met."""
+    """The landmarks in their order along the edge."""
     return [
         {
             "along": float(landmarks.positions[k]),
@@ -127,21 +131,15 @@ def _edge_landmark_entries(landmarks: LandmarkSequence) -> list[dict[str, object
     ]
 
 
-TOPOLOGY, LANDMARKS = "topology.graphml", "landmarks.json"
-
-_POSE = ("x", "y", "theta")
-_COVARIANCE = ("xx", "xy", "xt", "yy", "yt", "tt")
-
-
 def export_topology(directory: Path) -> tuple[Path, Path, Path]:
     """Write ``topology.graphml``, ``landmarks.json`` and ``places.json`` of the most probable hypothesis.
 
-    In the graph a node is an area with ``map_T_area``, the number of its ``keyframes``, whether the ``robot`` was in it
-    at the end, and the probability that it is a ``hallway`` and no room, which is missing where too little is known
-    around it; an edge from a to b an arc with ``a_T_b`` and whether it is a loop ``closure``. Poses are x, y in m and
-    theta in rad, xx to tt the upper triangle of their covariance in the right tangent frame. ``portals`` is the number
-    of openings that the path passed between the two; the most probable one stands with it, as portal_x to portal_tt,
-    ``a_T_portal`` with the heading from a to b, ``portal_width``, m, and the probability of its ``portal_existence``.
+    A node of the graph is an area with ``map_T_area``, the number of its ``keyframes``, whether the ``robot`` was in it
+    at the end, and the probability that it is a ``hallway``, where enough is known around it. An edge from a to b is an
+    arc with ``a_T_b`` and whether it is a loop ``closure``. Poses are x, y in m and theta in rad; xx to tt are the
+    upper triangle of the covariance in the right tangent frame. ``portals`` is the number of openings that the path
+    passed between the two areas. The most probable one is given as portal_x to portal_tt, ``a_T_portal`` with the
+    heading from a to b, ``portal_width``, m, and ``portal_existence``, its probability.
 
     :param directory: output folder of a run.
     :returns: the three files.
@@ -153,23 +151,23 @@ def export_topology(directory: Path) -> tuple[Path, Path, Path]:
     mapping = LocalMapping(saved.configuration)
     kinds, views = AreaClassifier(mapping), AreaViewCache(mapping, saved.replica.scans).views_of_map(hybrid_map)
     landmarks = {area: view.landmarks for area, view in views.items()}
-    # Takes a fifth of a second and a dozen megabytes, for this command alone.
-    import networkx as nx  # noqa: PLC0415
+    import networkx as nx  # noqa: PLC0415  it takes 0.2 s and 12 MB, for this command alone
 
     graph = nx.DiGraph()
     for area in hybrid_map.area_ids():
-        here = area == saved.replica.robot_areas[best]
-        numbers = _pose_values(saved.area_poses[area])
+        has_robot = area == saved.replica.robot_areas[best]
         keyframes = hybrid_map.keyframes(area)
         kind = kinds.classify([saved.replica.scans[k] for k in keyframes], stack_poses(keyframes))
         hallway = {} if kind is None else {"hallway": kind.probability}
-        graph.add_node(area, **numbers, keyframes=len(keyframes), robot=here, **hallway)
+        graph.add_node(
+            area, **_pose_values(saved.area_poses[area]), keyframes=len(keyframes), robot=has_robot, **hallway
+        )
     portals = find_portals(hybrid_map, landmarks, saved.configuration.features)
     for a, b, arc in hybrid_map.all_arcs():
         graph.add_edge(a, b, **_pose_values(arc.pose), closure=arc.closure, **_portal_attributes(portals, (a, b)))
     nx.write_graphml_xml(graph, directory / TOPOLOGY)
     document = {
-        "areas": {str(area): [_landmark_entry(one) for one in own] for area, own in landmarks.items()},
+        "areas": {str(area): [_landmark_entry(landmark) for landmark in known] for area, known in landmarks.items()},
         "portals": [_portal_entry(portal) for portal in portals],
     }
     (directory / LANDMARKS).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
@@ -178,13 +176,13 @@ def export_topology(directory: Path) -> tuple[Path, Path, Path]:
 
 
 def _portal_attributes(portals: Sequence[Portal], areas: tuple[int, int]) -> dict[str, float]:
-    """What an arc says of its portals."""
-    own = [portal for portal in portals if portal.areas == areas]
-    if not own:
+    """The attributes of an edge for the portals between two areas."""
+    between = [portal for portal in portals if portal.areas == areas]
+    if not between:
         return {"portals": 0}
-    best = max(own, key=lambda portal: portal.existence)
+    best = max(between, key=lambda portal: portal.existence)
     pose = {f"portal_{name}": value for name, value in _pose_values(best.pose_in_a).items()}
-    return {"portals": len(own), **pose, "portal_width": best.width, "portal_existence": best.existence}
+    return {"portals": len(between), **pose, "portal_width": best.width, "portal_existence": best.existence}
 
 
 def _landmark_entry(landmark: Landmark) -> dict[str, object]:

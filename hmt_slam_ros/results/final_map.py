@@ -1,4 +1,4 @@
-"""The final map: keyframes refined jointly over all areas, and every scan of the newest log placed among them."""
+"""The final map: joint refinement of all keyframes, and registration of all scans of the newest log with them."""
 
 from __future__ import annotations
 
@@ -40,8 +40,11 @@ from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.sensors.motion_model import OdometryBuffer, deskew_scan, path_covariance
 from hmt_slam_ros.sensors.scan import SweepCheck
 
-# A scan is where metric SLAM matched it, so that few steps suffice.
 _ITERATIONS = 2
+"""Gauss-Newton steps of a scan: metric SLAM has matched it already."""
+
+_BATCH = 500
+"""Scans whose surfaces are in memory at once."""
 
 
 def register_scans(
@@ -52,38 +55,38 @@ def register_scans(
     neighbor_rows: list[NDArray[np.int64]],
     options: RefinementParameters,
 ) -> NDArray[np.float64]:
-    """Register scans with keyframes that stay where they are.
+    """Register scans with fixed keyframes.
 
-    :param surfaces: of n keyframes.
-    :param poses: shape (n, 3), theirs.
-    :param scans: m scans.
-    :param initial: shape (m, 3), where they are thought to be, with the deviations ``options.scan_sigma`` and
+    :param surfaces: surfaces of n keyframes.
+    :param poses: shape (n, 3), poses of the keyframes.
+    :param scans: surfaces of m scans.
+    :param initial: shape (m, 3), initial poses of the scans, a prior with the deviations ``options.scan_sigma`` and
         ``options.scan_angle``.
-    :param neighbor_rows: for every scan the rows of the keyframes to register with.
-    :returns: shape (m, 3).
+    :param neighbor_rows: rows of the keyframes to register with, for each scan.
+    :returns: shape (m, 3), poses of the scans.
     """
     scan_of = np.repeat(np.arange(len(neighbor_rows)), [len(rows) for rows in neighbor_rows])
     keyframe_of = np.concatenate([np.zeros(0, np.int64), *neighbor_rows])
     prior = np.diag([options.scan_sigma**-2, options.scan_sigma**-2, math.radians(options.scan_angle) ** -2])
-    placed = initial
+    refined = initial
     for _ in range(_ITERATIONS):
-        relative = se2.between(poses[keyframe_of], placed[scan_of])
+        relative = se2.between(poses[keyframe_of], refined[scan_of])
         information, gradient, share = normal_equations(
             scans, scan_of, surfaces, keyframe_of, relative, options.last_gate, weighting_from_options(options), 1
         )
-        meets = share >= options.min_share
+        matched = share >= options.min_share
         total, slope = (
             np.broadcast_to(prior, (len(neighbor_rows), 3, 3)).copy(),
-            se2.log(se2.between(initial, placed)) @ prior,
+            se2.log(se2.between(initial, refined)) @ prior,
         )
-        np.add.at(total, scan_of[meets], information[meets])
-        np.add.at(slope, scan_of[meets], gradient[meets])
-        placed = se2.compose(placed, se2.exp(-np.linalg.solve(total, slope[..., None])[..., 0]))
-    return placed
+        np.add.at(total, scan_of[matched], information[matched])
+        np.add.at(slope, scan_of[matched], gradient[matched])
+        refined = se2.compose(refined, se2.exp(-np.linalg.solve(total, slope[..., None])[..., 0]))
+    return refined
 
 
 def deskewed_scans(log: Log, configuration: Configuration) -> Iterator[Scan]:
-    """All scans in file order, each as soon as the odometry covers its sweep, if it has one.
+    """All scans in file order, each deskewed as soon as the odometry covers its sweep.
 
     :raises HmtSlamError: where the log is faulty.
     """
@@ -100,21 +103,17 @@ def deskewed_scans(log: Log, configuration: Configuration) -> Iterator[Scan]:
 
 
 def _deskew_by_odometry(scan: Scan, odometry: OdometryBuffer, configuration: Configuration) -> Scan:
-    odometry.pose_at(scan.stamp)  # forgets what lies before
+    odometry.pose_at(scan.stamp)  # drops earlier readings
     return deskew_scan(scan, odometry, configuration.rtl)
-
-
-# Scans whose surfaces are in memory at once.
-_BATCH = 500
 
 
 @dataclass(frozen=True, eq=False)
 class FinalMap:
-    """A run's map and trajectory at their best.
+    """The refined map and trajectory of a run.
 
-    :ivar recording: with the refined map and trajectory.
-    :ivar stages: {name: trajectory} before each step: ``filter`` with the areas as they were traveled through, no loop
-        closed, ``arcs`` with the areas where the arcs put them, ``keyframes`` with the refined keyframes.
+    :ivar recording: recording with the refined map and trajectory.
+    :ivar stages: {name: trajectory} before each step: ``filter`` without loop closures, ``arcs`` with the areas at the
+        poses from the arcs, ``keyframes`` with the refined keyframes.
     """
 
     recording: Recording
@@ -122,31 +121,31 @@ class FinalMap:
 
 
 def final_map(recording: Recording, scans: Iterable[Scan], configuration: Configuration) -> FinalMap:
-    """Refine a run's map, if it is one that may change.
+    """Refine the map of a run, unless the mode is localization.
 
-    :param scans: all scans of the newest log in its order; those of earlier logs stay where they are to keyframes.
+    :param scans: all scans of the newest log in its order; those of earlier logs keep their poses to keyframes.
     """
-    travelled = trajectory_in_map(
+    open_loop = trajectory_in_map(
         recording.relative_trajectory, keyframe_poses(recording.hybrid_map, _open_loop_area_poses(recording))
     )
-    stages = {"filter": travelled, "arcs": recording.trajectory}
+    stages = {"filter": open_loop, "arcs": recording.trajectory}
     if not configuration.refinement.iterations or configuration.mode == "localization":
         return FinalMap(recording, stages)
-    keyframes = _KeyframeRefinement(recording, configuration)
-    refined = _with_keyframe_poses(recording, keyframes.refined_poses(recording))
+    refinement = _KeyframeRefinement(recording, configuration)
+    refined = _with_keyframe_poses(recording, refinement.refined_poses(recording))
     stages["keyframes"] = refined.trajectory
-    placed = keyframes.registered_trajectory(refined, scans)
+    trajectory = refinement.registered_trajectory(refined, scans)
     relative = refined.relative_trajectory.with_trajectory(
-        placed, keyframe_poses(refined.hybrid_map, refined.area_poses)
+        trajectory, keyframe_poses(refined.hybrid_map, refined.area_poses)
     )
-    return FinalMap(replace(refined, trajectory=placed, relative_trajectory=relative), stages)
+    return FinalMap(replace(refined, trajectory=trajectory, relative_trajectory=relative), stages)
 
 
 class _KeyframeRefinement:
-    """The keyframes of the most probable map, in the order in which they were taken.
+    """Refinement of the n keyframes of the most probable map.
 
-    :ivar ids: their ids, ascending.
-    :ivar areas: shape (n,), theirs.
+    :ivar ids: ids of the keyframes, ascending.
+    :ivar areas: shape (n,), area of each keyframe.
     """
 
     def __init__(self, recording: Recording, configuration: Configuration) -> None:
@@ -172,9 +171,9 @@ class _KeyframeRefinement:
         return nearest_keyframes(poses, self.areas, seen_from, areas, self._linked, self._options.reach, count)
 
     def refined_poses(self, recording: Recording) -> dict[int, NDArray[np.float64]]:
-        """{keyframe: ``map_T_base``} by joint refinement; the first keyframe stays."""
+        """{keyframe: ``map_T_base``} by joint refinement; the first keyframe is fixed."""
         poses = self._poses(recording)
-        # Each keyframe is the nearest to itself.
+        # One more neighbor, since each keyframe is the nearest to itself.
         around = self._neighbor_rows(poses, poses, self.areas, self._options.neighbors + 1)
         near = scan_pairs(around, self._options.min_share)
         certain = certain_areas(recording.hybrid_map, self._options.first_gate)
@@ -184,10 +183,9 @@ class _KeyframeRefinement:
         return dict(zip(self.ids, refined, strict=True))
 
     def _motion_edges(self, recording: Recording, poses: NDArray[np.float64]) -> Edges:
-        """From each keyframe to the next the motion that metric SLAM found, as uncertain as the odometry of that way.
+        """Edges from each keyframe to the next: the motion by metric SLAM, with the covariance of the odometry.
 
-        Where no pair of scans overlaps enough, metric SLAM has seen more in its map than odometry could tell. From one
-        log to the next nothing is known of it.
+        They hold keyframes whose scans overlap too little. The edge from one log to the next is uninformative.
         """
         rows, count = _scan_rows(recording, self.ids), len(poses) - 1
         steps = se2.between(poses[:-1], poses[1:])
@@ -201,25 +199,25 @@ class _KeyframeRefinement:
         """The trajectory with every scan of the newest log registered with the keyframes around it."""
         poses, options = self._poses(recording), self._options
         areas = self.areas[np.searchsorted(self.ids, np.maximum(recording.relative_trajectory.keyframes, self.ids[0]))]
-        placed, remaining = recording.trajectory.copy(), iter(scans)
-        for first in range(recording.first_scans[-1], len(placed), _BATCH):
+        trajectory, remaining = recording.trajectory.copy(), iter(scans)
+        for first in range(recording.first_scans[-1], len(trajectory), _BATCH):
             batch = list(itertools.islice(remaining, _BATCH))
             rows = slice(first, first + len(batch))
-            around = self._neighbor_rows(poses, placed[rows], areas[rows], options.scan_neighbors)
-            placed[rows] = register_scans(
-                self._surfaces, poses, self._surfaces_of(batch), placed[rows], around, options
+            around = self._neighbor_rows(poses, trajectory[rows], areas[rows], options.scan_neighbors)
+            trajectory[rows] = register_scans(
+                self._surfaces, poses, self._surfaces_of(batch), trajectory[rows], around, options
             )
-        return placed
+        return trajectory
 
 
 def _scan_rows(recording: Recording, keyframes: list[int]) -> NDArray[np.intp]:
-    """Numbers of the scans of keyframes."""
+    """Numbers of the scans that became keyframes."""
     stamps = [recording.replica.scans[keyframe].stamp for keyframe in keyframes]
     return np.searchsorted(recording.stamps, stamps)
 
 
 def _path_covariances(odometry: Trajectory, rows: NDArray[np.intp], motion: MotionParameters) -> NDArray[np.float64]:
-    """Covariances (n - 1, 3, 3) of the odometry along the paths between n scans of the log."""
+    """Covariances of the odometry between n scans of the log, shape (n - 1, 3, 3)."""
     steps = se2.between(odometry[:-1], odometry[1:])
     distance = np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))[rows]
     angle = np.concatenate(([0.0], np.cumsum(np.abs(steps[:, 2]))))[rows]
@@ -231,8 +229,8 @@ def _path_covariances(odometry: Trajectory, rows: NDArray[np.intp], motion: Moti
 def _with_keyframe_poses(recording: Recording, poses: Mapping[int, NDArray[np.float64]]) -> Recording:
     """The recording with its keyframes at given ``map_T_base``.
 
-    An area's frame moves with the first of its keyframes. Arcs take over the poses between the frames, and keep their
-    covariances as what is known of them at least.
+    The frame of an area moves with its first keyframe. Arcs get the poses between the new frames and keep their
+    covariances, which are upper bounds.
     """
     hybrid_map = recording.hybrid_map.branch()
     area_poses = {}
@@ -256,7 +254,7 @@ def _with_keyframe_poses(recording: Recording, poses: Mapping[int, NDArray[np.fl
 
 
 def _open_loop_area_poses(recording: Recording) -> dict[int, PoseGaussian]:
-    """``map_T_area`` along the arcs that closed no loop; as it is where no such arc leads there."""
+    """``map_T_area`` along the arcs that closed no loop; unchanged for areas that these do not reach."""
     hybrid_map = recording.hybrid_map
     open_map = HybridMap(changed_areas={area: dict(hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()})
     for a, b, arc in hybrid_map.all_arcs():

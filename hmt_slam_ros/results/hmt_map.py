@@ -1,7 +1,7 @@
-"""hmt_map/: the HMT map as a folder, the same byte for byte for the same run, and read back complete.
+"""hmt_map/: the HMT map as a folder, equal byte for byte for equal runs.
 
-Part ``map`` is the map at its best, after the final refinement; the others are the state from which a run goes on, as
-it was before that. docs/reference/map_format.md describes every file and field.
+Part ``map`` is the map after the final refinement. The other parts are the state before it, from which a run continues.
+docs/reference/map_format.md describes every file and field.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from hmt_slam_ros.saved_map.folder import CONFIGURATION, FORMAT, VERSION, FileRe
 
 @dataclass(frozen=True, eq=False)
 class RunState:
-    """All that a run in lock-step knows between two records of a log, at first before the first one.
+    """The state of a run in lock-step between two records of a log; by default before the first.
 
-    :ivar log: how far the logs were read.
-    :ivar processes: {process: its state}, of all processes of the table.
-    :ivar recorder: what the output folder needs of the run so far.
+    :ivar log: progress through the logs.
+    :ivar processes: {process: state}, of all processes of the table.
+    :ivar recorder: record of the run.
     """
 
     log: LogProgress = field(default_factory=LogProgress)
@@ -41,23 +41,23 @@ class RunState:
 
     @classmethod
     def from_parts(cls, parts: Mapping[str, Any]) -> RunState:
-        """The state of its parts, as :attr:`parts` gives them."""
+        """The state with given :attr:`parts`."""
         return cls(parts["log"], {row.name: parts[row.name] for row in PROCESSES}, parts["recorder"])
 
     @property
     def parts(self) -> dict[str, Any]:
-        """{name of the part: its value}, with the names of :data:`PARTS`."""
+        """{name in :data:`PARTS`: value}."""
         return {"log": self.log, **self.processes, "recorder": self.recorder}
 
 
 @dataclass(frozen=True, eq=False)
 class MapDocument:
-    """The map at its best.
+    """The map after the final refinement.
 
     :ivar replica: the maps of the live hypotheses; that of the most probable one is refined.
     :ivar area_poses: ``map_T_area`` of all areas of the most probable hypothesis, ordered by id.
-    :ivar last_estimate: where the robot was last.
-    :ivar relative_trajectory: where the scans of all logs were taken; none in a map that nodes saved.
+    :ivar last_estimate: last estimate of metric SLAM.
+    :ivar relative_trajectory: poses of the scans of all logs; empty in a map that nodes saved.
     """
 
     replica: ReplicaState
@@ -68,9 +68,9 @@ class MapDocument:
 
 @dataclass(frozen=True)
 class ChainState:
-    """Where the messages between the processes go on.
+    """The position in the sequence of keyframe events.
 
-    :ivar events: keyframe events up to now, which is the number of the next one.
+    :ivar events: number of keyframe events so far, which is the number of the next one.
     """
 
     events: int
@@ -81,17 +81,17 @@ PARTS: Mapping[str, type] = {
     **{row.name: row.state_class for row in PROCESSES},
     "recorder": RunRecord,
 }
-"""{part of the state from which a run goes on: its class}; each is a file of the map."""
+"""{part of the state: class}; each is a file of the map."""
 
 
 @dataclass(frozen=True, eq=False)
 class SavedMap:
-    """A map as read back.
+    """A map that was read.
 
     :ivar replica: scans and maps of the live hypotheses with their probabilities.
     :ivar area_poses: {area: belief over ``map_T_area``} of the most probable hypothesis.
-    :ivar configuration: that of the run.
-    :ivar relative_trajectory: where the scans of all logs were taken, if that is known.
+    :ivar configuration: configuration of the run.
+    :ivar relative_trajectory: poses of the scans of all logs, empty where unknown.
     """
 
     replica: Replica
@@ -101,25 +101,25 @@ class SavedMap:
 
 
 class MapWriter:
-    """Writes a map into a folder: first the state, if there is one to go on from, last the map at its best."""
+    """Writes a map into a folder: first the state, where there is one, last the refined map."""
 
     def __init__(self, directory: Path) -> None:
-        """:param directory: to be made."""
+        """:param directory: folder that is made."""
         self._folder = FolderWriter(directory)
 
     def write_state(self, state: RunState) -> None:
-        """Write what a run goes on from."""
+        """Write the state from which a run continues."""
         for name, part in state.parts.items():
             self._folder.write(name, part)
         self._folder.write("chain", ChainState(state.processes[COORDINATOR].keyframe_events))
 
     def write_slam_state(self, state: SlamState) -> None:
-        """Write metric SLAM's part of what nodes go on from; :meth:`join` takes those of the others."""
+        """Write the state of metric SLAM; :meth:`add_files` takes those of the other nodes."""
         self._folder.write(COORDINATOR, state)
         self._folder.write("chain", ChainState(state.keyframe_events))
 
     def add_files(self, files: Iterable[FileRecord]) -> None:
-        """Take in files that others wrote into the folder."""
+        """Add files that other processes wrote into the folder."""
         self._folder.add_files(files)
 
     def write_map(
@@ -129,28 +129,31 @@ class MapWriter:
         last_estimate: LocalEstimate,
         relative_trajectory: RelativeTrajectory | None = None,
     ) -> None:
-        """Write the map at its best.
+        """Write the map, with the scans of its keyframes.
 
         :param area_poses: {area: belief over ``map_T_area``} of the most probable hypothesis.
-        :param last_estimate: the last of what metric SLAM said.
-        :param relative_trajectory: where the scans of all logs were taken, where that is known.
+        :param last_estimate: last estimate of metric SLAM.
+        :param relative_trajectory: poses of the scans of all logs, None where unknown.
         """
-        mapped = sorted({k for own in replica.maps.values() for area in own.area_ids() for k in own.keyframes(area)})
+        maps = replica.maps.values()
+        mapped = sorted(
+            {k for hybrid_map in maps for area in hybrid_map.area_ids() for k in hybrid_map.keyframes(area)}
+        )
         scans = {keyframe: replica.scans[keyframe] for keyframe in mapped}
-        kept = Replica(scans, replica.maps, replica.probabilities, replica.robot_areas)
+        saved = Replica(scans, replica.maps, replica.probabilities, replica.robot_areas)
         poses = tuple(AreaPose(area, pose) for area, pose in sorted(area_poses.items()))
         self._folder.write(
-            "map", MapDocument(kept.state, poses, last_estimate, relative_trajectory or RelativeTrajectory.empty())
+            "map", MapDocument(saved.state, poses, last_estimate, relative_trajectory or RelativeTrajectory.empty())
         )
 
     def finish(self, configuration: Configuration) -> None:
-        """Write the configuration, and last the manifest."""
+        """Write the configuration and the manifest."""
         self._folder.write_text(CONFIGURATION, ros_yaml(configuration))
         self._folder.finish(FORMAT, VERSION)
 
 
 def read_saved_map(directory: Path) -> SavedMap:
-    """Read the map at its best.
+    """The map in a folder.
 
     :raises HmtSlamError: where the folder holds no map, one of another version, or a damaged one.
     """
@@ -161,7 +164,7 @@ def read_saved_map(directory: Path) -> SavedMap:
 
 
 def read_run_state(directory: Path) -> tuple[RunState, Configuration]:
-    """Read what a run goes on from, and the configuration with which it was made.
+    """The state from which a run continues, and the configuration of the run that saved it.
 
     :raises HmtSlamError: as :func:`read_saved_map`, and where the map was saved without its state.
     """

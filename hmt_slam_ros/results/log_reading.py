@@ -1,4 +1,4 @@
-"""How far the logs of a map were read, and what a run that goes on from a saved map starts with."""
+"""Progress through the logs of a map, and the parameters of a run that continues a saved map."""
 
 from __future__ import annotations
 
@@ -21,21 +21,20 @@ from hmt_slam_ros.results.trajectories import RelativeTrajectory
 from hmt_slam_ros.saved_map.folder import HMT_MAP
 from hmt_slam_ros.sensors import Scan
 
-# Of the map's clock, from the last scan of a log to the first record of the next.
 _BETWEEN_LOGS = 60 * NANOSECONDS
+"""Time on the map's clock from the last scan of a log to the first record of the next, ns."""
 
 
 @dataclass(frozen=True, eq=False)
 class LogProgress:
-    """How far the logs of a map were read.
+    """Progress through the logs of a map.
 
-    :ivar records_read: scans and odometry readings of the newest log.
-    :ivar stamps: shape (n,), of the scans of all logs on the map's clock, ns, increasing.
-    :ivar source_stamps: shape (n,), the logs' own stamps of them, ns.
+    :ivar records_read: number of scans and odometry readings read of the newest log.
+    :ivar stamps: shape (n,), stamps of the scans of all logs on the map's clock, ns, increasing.
+    :ivar source_stamps: shape (n,), the logs' own stamps of these scans, ns.
     :ivar first_scans: number of the first scan of each log.
-    :ivar earlier_trajectory: where the scans of all logs before the newest were taken after the final refinement of
-        that time, or none.
-    :ivar clock_offset: what the map's clock is ahead of the running clock of the newest log, ns.
+    :ivar earlier_trajectory: refined trajectory of the scans of all logs before the newest, empty for one log.
+    :ivar clock_offset: map's clock less the running clock of the newest log, ns.
     :ivar checksum: CRC-32 of the ranges of the first scan of the newest log.
     """
 
@@ -49,7 +48,7 @@ class LogProgress:
 
 
 def is_newest_log(state: LogProgress, log: Log) -> bool:
-    """Whether a log is the newest one of a map, and no further one: it begins with the same scan."""
+    """Whether a log is the newest log of a map, that is, begins with the same scan."""
     first = state.first_scans[-1]
     if first == state.stamps.size:
         return True
@@ -60,54 +59,45 @@ def is_newest_log(state: LogProgress, log: Log) -> bool:
 
 
 class LogReader:
-    """Reads one log after the other."""
+    """Reads one log after the other onto the map's clock."""
 
     def __init__(self, state: LogProgress) -> None:
-        """:param state: to go on from."""
-        self._records_read, self._first_scans, self._earlier_trajectory = (
-            state.records_read,
-            state.first_scans,
-            state.earlier_trajectory,
-        )
-        self._clock_offset, self._checksum = state.clock_offset, state.checksum
+        """:param state: progress from which reading continues."""
+        self._progress, self._records_read = state, state.records_read
         self._stamps, self._source_stamps = (array("q", part.tobytes()) for part in (state.stamps, state.source_stamps))
 
     @property
     def state(self) -> LogProgress:
-        """How far the logs were read, as a value."""
-        running, source = np.array(self._stamps, np.int64), np.array(self._source_stamps, np.int64)
-        return LogProgress(
-            self._records_read,
-            running,
-            source,
-            self._first_scans,
-            self._earlier_trajectory,
-            self._clock_offset,
-            self._checksum,
-        )
+        """The progress as a value."""
+        stamps, source_stamps = np.array(self._stamps, np.int64), np.array(self._source_stamps, np.int64)
+        return replace(self._progress, records_read=self._records_read, stamps=stamps, source_stamps=source_stamps)
 
     @property
     def scans_read(self) -> int:
-        """Scans of the newest log that were read."""
-        return len(self._stamps) - self._first_scans[-1]
+        """Number of scans read of the newest log."""
+        return len(self._stamps) - self._progress.first_scans[-1]
 
     @property
     def stamp_bytes(self) -> int:
-        """What the stamps of the scans take."""
+        """Memory of the stamps, bytes."""
         return sum(len(stamps) * stamps.itemsize for stamps in (self._stamps, self._source_stamps))
 
     def begin_log(self, log: Log) -> None:
-        """Begin a further log, on a clock that goes on."""
-        self._first_scans = (*self._first_scans, len(self._stamps))
+        """Begin a further log. The map's clock continues after the last scan."""
         first = next((record.measurement.stamp for record in log.records()), 0)
-        self._records_read, self._clock_offset = 0, self._stamps[-1] + _BETWEEN_LOGS - first
+        self._progress = replace(
+            self._progress,
+            first_scans=(*self._progress.first_scans, len(self._stamps)),
+            clock_offset=self._stamps[-1] + _BETWEEN_LOGS - first,
+        )
+        self._records_read = 0
 
     def unread_records(self, log: Log) -> Iterator[LogRecord]:
-        """The records of the newest log that were not read, with stamps on the map's clock.
+        """The unread records of the newest log, with stamps on the map's clock.
 
-        :raises HmtSlamError: where it is not as it was when the others were read.
+        :raises HmtSlamError: where the records that were read differ from those of the log.
         """
-        first = self._first_scans[-1]
+        first = self._progress.first_scans[-1]
         scans = zip(self._stamps[first:], self._source_stamps[first:], strict=True)
         records = map(self._to_map_clock, log.records())
         for record in itertools.islice(records, self._records_read):
@@ -124,25 +114,22 @@ class LogReader:
         return records
 
     def mark_read(self, record: LogRecord) -> None:
-        """Note that a record was read."""
+        """Count a record as read."""
         self._records_read += 1
         if isinstance(record.measurement, Scan):
             if not self.scans_read:
-                self._checksum = _checksum(record.measurement)
+                self._progress = replace(self._progress, checksum=_checksum(record.measurement))
             running, source = _scan_stamps(record)
             self._stamps.append(running)
             self._source_stamps.append(source)
 
     def _to_map_clock(self, record: LogRecord) -> LogRecord:
-        if not self._clock_offset:
-            return record
-        return replace(
-            record, measurement=replace(record.measurement, stamp=record.measurement.stamp + self._clock_offset)
-        )
+        offset, measurement = self._progress.clock_offset, record.measurement
+        return replace(record, measurement=replace(measurement, stamp=measurement.stamp + offset)) if offset else record
 
 
 def _scan_stamps(record: LogRecord) -> tuple[int, int]:
-    """Of a scan, on the map's clock and the log's own, ns."""
+    """Stamps of a scan on the map's clock and on the log's own, ns."""
     return record.measurement.stamp, record.source_stamp
 
 
@@ -150,11 +137,12 @@ def _checksum(scan: Scan) -> int:
     return zlib.crc32(scan.ranges.tobytes())
 
 
-# Which part of a log is used, how it is played, what is done with known ground, and who drives.
 _CHANGEABLE = ("robot.", "mode", "explorer.", "pilot.")
-# Where a log begins that goes on.
+"""Prefixes of parameters that may change silently when a run continues: they do not concern the map."""
+
 _START = "robot.start"
-# What the numbers in the state mean depends on these.
+"""The parameter with the beginning of a log, which is fixed unless the log is a further one."""
+
 FIXED_PARAMETERS = (
     "filter.particles",
     "local_map.kind",
@@ -162,19 +150,23 @@ FIXED_PARAMETERS = (
     "local_map.extent",
     "local_map.field_radius",
 )
+"""Parameters that may not change within a saved map: the numbers in its state depend on them."""
 
 
 def map_folder(path: Path) -> Path:
-    """The folder of the map, where that or the output folder around it is given."""
-    inner = path / HMT_MAP
-    return inner if inner.is_dir() else path
+    """The folder of a map.
+
+    :param path: that folder, or the output folder around it.
+    """
+    folder = path / HMT_MAP
+    return folder if folder.is_dir() else path
 
 
 def describe_log(read: LogProgress, name: str, *, further: bool) -> str:
-    """A sentence about whether a log is the newest one of a map, or a further one.
+    """A sentence that says whether a log is the newest log of a map, or a further one.
 
-    :param read: what was read of the logs of the map.
-    :param name: of the log.
+    :param read: progress through the logs of the map.
+    :param name: name of the log.
     """
     if further:
         return (
@@ -186,11 +178,12 @@ def describe_log(read: LogProgress, name: str, *, further: bool) -> str:
 
 
 def describe_parameter_changes(saved: Configuration, asked: Configuration, *, further: bool = False) -> str | None:
-    """A sentence about the parameters that change as the run goes on, None where none does.
+    """A sentence about the parameters that change when a run continues, None where none changes.
 
-    :param saved: the configuration of the map.
-    :param further: whether the log is a further one, which may begin anywhere.
-    :raises HmtSlamError: where one of them cannot change.
+    :param saved: configuration of the map.
+    :param asked: configuration of the run.
+    :param further: whether the log is a further one, so that ``robot.start`` may change.
+    :raises HmtSlamError: where a fixed parameter changes.
     """
     before, now = as_flat(saved), as_flat(asked)
     changed = [name for name in before if before[name] != now[name]]

@@ -1,11 +1,16 @@
-"""The output folder of a run, written complete or not at all."""
+"""The output folder of a run, written complete or not at all: trajectories, map, report and tables."""
 
 from __future__ import annotations
 
+import csv
+import json
+import platform
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,21 +18,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros import __version__
+from hmt_slam_ros.configuration import Configuration, as_nested
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import StampedPoses, write_tum
 from hmt_slam_ros.grids.occupancy_map import occupancy_image, write_map
 from hmt_slam_ros.results.export import LANDMARKS, PLACES, TOPOLOGY
 from hmt_slam_ros.results.final_map import FinalMap
 from hmt_slam_ros.results.hmt_map import MapWriter
+from hmt_slam_ros.results.record import TopologyProbability
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses
-from hmt_slam_ros.results.report import RunMetrics, build_report, write_cost, write_probabilities, write_report
 from hmt_slam_ros.saved_map.folder import HMT_MAP, MANIFEST, replace_folder
+from hmt_slam_ros.sensors import Scan
 
 EARLIER_LOGS = "earlier"
-"""The folder of the trajectories of earlier logs, 1.tum, 2.tum and so on."""
+"""Folder of the trajectories of earlier logs: 1.tum, 2.tum and so on."""
 
-# Everything that ever stands in an output folder; a folder with anything else in it is not ours to replace.
 OUTPUT_NAMES = frozenset(
     {
         "trajectory.tum",
@@ -49,13 +55,44 @@ OUTPUT_NAMES = frozenset(
         "cost.png",
     }
 )
+"""All names in output folders. A folder with any other name in it is never replaced."""
+
+_LIBRARIES = ("numpy", "scipy", "networkx", "numba", "rosbags", "matplotlib")
+"""Libraries whose versions the report has."""
+
+_PROBABILITY_COLUMNS = {"path_length": "travelled"}
+"""Columns of pmf.csv with another name than the field."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunMetrics:
+    """The measured cost of a run.
+
+    :ivar log: name of the log.
+    :ivar runtime: "lock-step" or "nodes".
+    :ivar seconds_per_scan: {process: shape (n,), computing time for each scan, s}.
+    :ivar peak_rss: {OS process: largest resident memory, bytes}.
+    :ivar wall_seconds: time from the first record to the last answer, s.
+    :ivar cpu_seconds: CPU time of all OS processes together, s.
+    :ivar refinement_seconds: CPU time of the final refinement, s.
+    :ivar memory: {part of the program: bytes}, where it is known.
+    """
+
+    log: str
+    runtime: str
+    seconds_per_scan: Mapping[str, NDArray[np.float64]]
+    peak_rss: Mapping[str, int]
+    wall_seconds: float
+    cpu_seconds: float
+    refinement_seconds: float
+    memory: Mapping[str, int] = field(default_factory=dict)
 
 
 @contextmanager
 def atomic_output(directory: Path) -> Iterator[Path]:
-    """A folder to write into that becomes ``directory`` if all goes well, and vanishes if not.
+    """A context with a folder that becomes ``directory`` at the end, and is deleted on an exception.
 
-    :raises HmtSlamError: where ``directory`` is something else than an old output folder, or cannot be made.
+    :raises HmtSlamError: where ``directory`` is anything but an old output folder, or cannot be written.
     """
     target = directory.absolute()
     check_replaceable(target)
@@ -78,7 +115,7 @@ def atomic_output(directory: Path) -> Iterator[Path]:
 
 
 def check_replaceable(directory: Path) -> None:
-    """Refuse a path that holds something that would be lost.
+    """Check that writing to a path loses no data.
 
     :raises HmtSlamError: unless there is nothing, an empty folder or an old output folder.
     """
@@ -104,28 +141,29 @@ def write_output(
 ) -> None:
     """Write every file of a run.
 
-    :param directory: an empty folder, see :func:`replacing`.
+    :param directory: an empty folder, see :func:`atomic_output`.
     :param source_stamps: shape (n,), the logs' own stamps of all scans, ns, in file order.
-    :param state: of :func:`map_writer`, where the state of the run was kept.
+    :param state: the :func:`map_writer` that wrote the state of the run, None for a map without a state.
     """
     recording = final.recording
     _write_trajectories(directory, final, source_stamps)
     _write_map(directory, recording, configuration)
-    saved = state or map_writer(directory)
-    saved.write_map(recording.replica, recording.area_poses, recording.last_estimate, recording.relative_trajectory)
-    saved.finish(configuration)
+    writer = state or map_writer(directory)
+    writer.write_map(recording.replica, recording.area_poses, recording.last_estimate, recording.relative_trajectory)
+    writer.finish(configuration)
     write_graph(directory / "graph.g2o", recording)
     write_probabilities(directory / "pmf.csv", recording.probabilities)
     write_cost(directory / "cost.csv", figures.seconds_per_scan)
-    write_report(directory / "report.json", build_report(recording, configuration, figures))
-    # matplotlib is loaded when the processes have given their memory back, and only where something is drawn.
+    report = json.dumps(build_report(recording, configuration, figures), indent=1, allow_nan=False)
+    (directory / "report.json").write_text(report + "\n", encoding="utf-8")
+    # matplotlib is loaded only here, after the processes have released their memory.
     from hmt_slam_ros.results.plots import plot_map  # noqa: PLC0415
 
     plot_map(directory)
 
 
 def _write_trajectories(directory: Path, final: FinalMap, source_stamps: NDArray[np.int64]) -> None:
-    """Those of the newest log, and of the earlier ones where they are in the final map."""
+    """Write the trajectories of the newest log, and the final ones of the earlier logs."""
     recording = final.recording
     trajectories = {"trajectory": recording.trajectory, "trajectory_online": recording.online_trajectory}
     trajectories |= {f"stages/{name}": trajectory for name, trajectory in final.stages.items()}
@@ -140,22 +178,22 @@ def _write_trajectories(directory: Path, final: FinalMap, source_stamps: NDArray
 
 
 def map_writer(directory: Path) -> MapWriter:
-    """What writes the map of an output folder."""
+    """The writer of the map of an output folder."""
     return MapWriter(directory / HMT_MAP)
 
 
 def _write_map(directory: Path, recording: Recording, configuration: Configuration) -> None:
-    placed = keyframe_poses(recording.hybrid_map, recording.area_poses)
-    scans = [recording.replica.scans[keyframe] for keyframe in placed]
+    poses = keyframe_poses(recording.hybrid_map, recording.area_poses)
+    scans = [recording.replica.scans[keyframe] for keyframe in poses]
     settings = configuration.local_map
-    write_map(directory, occupancy_image(scans, np.array(list(placed.values())), settings.cell, settings.max_range))
+    write_map(directory, occupancy_image(scans, np.array(list(poses.values())), settings.cell, settings.max_range))
 
 
 def write_graph(path: Path, recording: Recording) -> None:
-    """Areas as VERTEX_SE2 and arcs as EDGE_SE2.
+    """Write areas as VERTEX_SE2 and arcs as EDGE_SE2 of g2o.
 
-    The error that g2o weighs is the vector (x, y, theta) of measurement^-1 * estimate, which to first order is the
-    right tangent xi of our covariances, so the information matrix is their inverse.
+    The error of g2o is the vector (x, y, theta) of measurement^-1 * estimate. To first order this is the right tangent
+    of the covariances, so that the information matrix is their inverse.
     """
     lines = [f"VERTEX_SE2 {area} {_format_numbers(pose.mean)}\n" for area, pose in sorted(recording.area_poses.items())]
     upper = np.triu_indices(3)
@@ -167,3 +205,105 @@ def write_graph(path: Path, recording: Recording) -> None:
 
 def _format_numbers(values: NDArray[Any]) -> str:
     return " ".join(f"{value:.12g}" for value in values)
+
+
+def build_report(recording: Recording, configuration: Configuration, figures: RunMetrics) -> dict[str, Any]:
+    """The content of report.json."""
+    totals, replica, hybrid_map = recording.totals, recording.replica, recording.hybrid_map
+    arcs = [arc for _, _, arc in hybrid_map.all_arcs()]
+    return {
+        "log": figures.log,
+        "runtime": figures.runtime,
+        "scans": {"in": totals.received, "processed": totals.processed, "dropped": totals.dropped},
+        "travelled_m": recording.probabilities[-1].path_length,
+        "keyframe_events": recording.probabilities[-1].keyframe + 1,
+        "keyframes": sum(len(hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()),
+        "areas": len(hybrid_map.area_ids()),
+        "arcs": len(arcs),
+        "loop_closures": sum(arc.closure for arc in arcs),
+        "hypotheses": {
+            "alive": len(replica.maps),
+            "most_probable": replica.best_hypothesis,
+            "probability": replica.probabilities[replica.best_hypothesis],
+        },
+        "notices": [{"process": notice.process, "text": notice.text} for notice in recording.notices],
+        "processes": {name: _cost_summary(seconds) for name, seconds in figures.seconds_per_scan.items()},
+        "peak_rss_bytes": dict(figures.peak_rss),
+        "memory_bytes": dict(figures.memory) | {"keyframe_scans": scan_bytes(replica.scans.values())},
+        "wall_s": figures.wall_seconds,
+        "cpu_s": figures.cpu_seconds,
+        "refinement_s": figures.refinement_seconds,
+        "seed": configuration.seed,
+        "configuration": as_nested(configuration),
+        "versions": _versions(),
+    }
+
+
+def _cost_summary(seconds: NDArray[np.float64]) -> dict[str, float]:
+    milliseconds = 1e3 * seconds if seconds.size else np.zeros(1)
+    return {
+        "total_s": float(seconds.sum()),
+        "mean_ms_per_scan": float(milliseconds.mean()),
+        "p95_ms_per_scan": float(np.percentile(milliseconds, 95)),
+        "max_ms_per_scan": float(milliseconds.max()),
+    }
+
+
+def _versions() -> dict[str, str]:
+    return {"hmt_slam_ros": __version__, "python": platform.python_version()} | {
+        name: _installed_version(name) for name in _LIBRARIES
+    }
+
+
+def _installed_version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def write_cost(path: Path, seconds_per_scan: Mapping[str, NDArray[np.float64]]) -> None:
+    """Write cost.csv: milliseconds of every process for every scan."""
+    rows = np.round(1e3 * np.column_stack(list(seconds_per_scan.values())), 4).tolist() if seconds_per_scan else []
+    _write_table(path, [f"{name}_ms" for name in seconds_per_scan], rows)
+
+
+def write_probabilities(path: Path, probabilities: list[TopologyProbability]) -> None:
+    """Write pmf.csv: Eq. (14), one line for every hypothesis at every keyframe event."""
+    header = [_PROBABILITY_COLUMNS.get(name, name) for name in TopologyProbability._fields]
+    rows = [[int(value) if isinstance(value, bool) else value for value in row] for row in probabilities]
+    _write_table(path, header, rows)
+
+
+def _write_table(path: Path, names: list[str], rows: list[list[float]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(names)
+        writer.writerows(rows)
+
+
+def code_bytes() -> dict[str, int]:
+    """Resident memory of this OS process that is mapped from ``libraries``, and that of compiled ``kernels``, bytes.
+
+    :returns: {} without /proc.
+    """
+    try:
+        lines = Path("/proc/self/smaps").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return {}
+    parts = {"libraries": 0, "kernels": 0}
+    part = None
+    for line in lines:
+        words = line.split()
+        if not words[0].endswith(":"):
+            # begin-end permissions offset device inode path
+            executable, file = "x" in words[1], words[4] != "0"
+            part = "libraries" if file else "kernels" if executable and len(words) == 5 else None
+        elif words[0] == "Rss:" and part is not None:
+            parts[part] += 1024 * int(words[1])
+    return parts
+
+
+def scan_bytes(scans: Iterable[Scan]) -> int:
+    """Memory of scans with their cached points, bytes."""
+    return sum(value.nbytes for scan in scans for value in vars(scan).values() if isinstance(value, np.ndarray))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import csv
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -23,13 +24,17 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.grids.occupancy_map import OccupancyImage, read_map
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
-from hmt_slam_ros.results.report import read_table
 
 Color = tuple[float, float, float]
 
 _DPI = 150
+"""Resolution of the pictures, pixels per inch."""
+
 _CLOSURE, _ARC, _PATH = "#d62728", "#1f3b70", "#555555"
+"""Colors of arcs that closed a loop, of other arcs and of the path."""
+
 _GOLDEN = 0.6180339887498949
+"""Golden section: steps of the hue from one number to the next."""
 
 
 def plot_all(directory: Path) -> list[Path]:
@@ -42,7 +47,7 @@ def plot_all(directory: Path) -> list[Path]:
 
 
 def plot_map(directory: Path) -> Path:
-    """map.png: the occupancy grid with path, areas, arcs and the 95 % ellipses of the areas' origins."""
+    """Draw map.png: the occupancy grid with path, areas, arcs and the 95 % ellipses of the areas' origins."""
     image, saved = read_map(directory), read_saved_map(directory / "hmt_map")
     path = read_tum(directory / "trajectory.tum").poses[:, :2]
     height, width = (size * image.resolution for size in image.pixels.shape)
@@ -77,7 +82,7 @@ def _draw_grid(axes: Axes, image: OccupancyImage) -> None:
 
 
 class _GridArtist(Artist):
-    """The occupancy grid, which fills the axes; ``imshow`` takes 60 MB more, for colors and interpolation."""
+    """The occupancy grid, which fills the axes. ``imshow`` would take 60 MB more for colors and interpolation."""
 
     def __init__(self, axes: Axes, pixels: NDArray[np.uint8]) -> None:
         super().__init__()
@@ -85,18 +90,18 @@ class _GridArtist(Artist):
         self.set_zorder(0)
 
     def draw(self, renderer: RendererBase) -> None:
-        """Paint every pixel of the picture in the darkest gray of the cells that it shows, so that walls stay."""
+        """Paint each pixel in the darkest gray of its cells, so that walls stay visible."""
         box = self._grid_axes.get_window_extent(renderer)
         left, bottom = round(box.x0), round(box.y0)
         width, height = round(box.x1) - left, round(box.y1) - bottom
         gray = _darkest_rows(_darkest_rows(self._pixels, height).T, width).T[::-1]
-        colours = np.full((height, width, 4), 255, np.uint8)
-        colours[..., :3] = gray[..., None]
-        renderer.draw_image(renderer.new_gc(), left, bottom, colours)
+        colors = np.full((height, width, 4), 255, np.uint8)
+        colors[..., :3] = gray[..., None]
+        renderer.draw_image(renderer.new_gc(), left, bottom, colors)
 
 
 def _darkest_rows(pixels: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
-    """As many rows as asked for: the minimum of the rows (n, m) that each covers, or the nearest where rows repeat."""
+    """Rows (n, m) resampled to ``count``: the minimum of the rows that each covers, or the nearest row."""
     starts = np.arange(count) * len(pixels) // count
     return pixels[starts] if count >= len(pixels) else np.minimum.reduceat(pixels, starts)
 
@@ -109,18 +114,21 @@ def _draw_keyframes(axes: Axes, hybrid_map: HybridMap, area_poses: Mapping[int, 
 
 
 def _draw_arcs(axes: Axes, hybrid_map: HybridMap, area_poses: Mapping[int, PoseGaussian]) -> None:
-    for closure, colour, label in ((False, _ARC, "arc"), (True, _CLOSURE, "arc that closed a loop")):
+    for closure, color, label in ((False, _ARC, "arc"), (True, _CLOSURE, "arc that closed a loop")):
         ends = [
             (area_poses[a].mean[:2], area_poses[b].mean[:2])
             for a, b, arc in hybrid_map.all_arcs()
             if arc.closure == closure
         ]
         if ends:
-            axes.add_collection(LineCollection(ends, colors=colour, linewidths=1.2, label=label, zorder=4))
+            axes.add_collection(LineCollection(ends, colors=color, linewidths=1.2, label=label, zorder=4))
 
 
 def _draw_areas(axes: Axes, saved: SavedMap, visible: float) -> None:
-    """Origins with their ids and ellipses; ellipses too small to see are drawn larger by a round factor, in meters."""
+    """Draw origins, ids and ellipses.
+
+    :param visible: least semi-major axis of the largest ellipse, m; smaller ones are enlarged by a round factor.
+    """
     ellipses = {area: belief.position_ellipse() for area, belief in saved.area_poses.items()}
     largest = max(ellipse.semi_major for ellipse in ellipses.values())
     factor = 1 if largest <= 0.0 else int(10 ** np.clip(np.ceil(np.log10(visible / largest)), 0, 2))
@@ -160,8 +168,8 @@ def _map_title(hybrid_map: HybridMap, path: NDArray[np.float64]) -> str:
 
 
 def plot_probabilities(directory: Path) -> Path:
-    """pmf.png: the distribution over the live topologies at every keyframe event, Eq. (14), and how many there are."""
-    table = _read_columns(directory / "pmf.csv")
+    """Draw pmf.png: the probabilities of the hypotheses at every keyframe event, Eq. (14), and their number."""
+    table = read_table(directory / "pmf.csv")
     if not table["stamp"].size:
         raise HmtSlamError(f"{directory / 'pmf.csv'} holds no probabilities: map the log again")
     minutes = (table["stamp"] - table["stamp"][0]) / 60e9
@@ -184,7 +192,7 @@ def plot_probabilities(directory: Path) -> Path:
 def _draw_bars(
     axes: Axes, table: Mapping[str, NDArray[np.float64]], minutes: NDArray[np.float64], firsts: NDArray[np.intp]
 ) -> None:
-    """One stack a keyframe event, from it to the next, one color a topology."""
+    """Draw one stack for each keyframe event, up to the next, with one color for each hypothesis."""
     counts = np.diff(np.append(firsts, minutes.size))
     tops = np.cumsum(table["probability"])
     tops -= np.repeat(tops[firsts] - table["probability"][firsts], counts)
@@ -192,28 +200,28 @@ def _draw_bars(
     edges = _bar_edges(minutes[firsts])
     left, right = edges[:-1].repeat(counts), edges[1:].repeat(counts)
     corners = np.stack([(left, bottoms), (right, bottoms), (right, tops), (left, tops)]).transpose(2, 0, 1)
-    colours = [_color_of(int(hypothesis)) for hypothesis in table["hypothesis"]]
-    axes.add_collection(PolyCollection(list(corners), facecolors=colours, edgecolors="none"))
+    colors = [_color_of(int(hypothesis)) for hypothesis in table["hypothesis"]]
+    axes.add_collection(PolyCollection(list(corners), facecolors=colors, edgecolors="none"))
     axes.plot([], [], "s", color="none", markeredgecolor="gray", label="white: not examined or dropped")
     axes.set_xlim(edges[0], edges[-1])
 
 
 def _bar_edges(starts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Starts of all bars and the end of the last one, which is as wide as most are."""
+    """Starts of all bars and the end of the last one, which has the median width."""
     return np.append(starts, starts[-1] + (float(np.median(np.diff(starts))) if starts.size > 1 else 1.0))
 
 
 def plot_cost(directory: Path) -> Path:
-    """cost.png: what every process computed for every scan."""
-    table = _read_columns(directory / "cost.csv")
+    """Draw cost.png: the computing time of every process for every scan."""
+    table = read_table(directory / "cost.csv")
     figure = Figure(figsize=(11.0, 5.0), layout="constrained")
     axes = figure.add_subplot()
     for k, (name, cost) in enumerate(table.items()):
         if cost.size:
             spread = f"p95 {np.percentile(cost, 95):.2f}, max {cost.max():.1f} ms"
             label = f"{name.removesuffix('_ms')}: mean {cost.mean():.2f}, {spread}"
-            busy = np.flatnonzero(cost)
-            axes.plot(busy, cost[busy], ".", markersize=3, color=f"C{k}", label=label)
+            scans = np.flatnonzero(cost)
+            axes.plot(scans, cost[scans], ".", markersize=3, color=f"C{k}", label=label)
     axes.set_yscale("log")
     axes.set_xlabel("scan")
     axes.set_ylabel("computing time [ms]")
@@ -223,15 +231,23 @@ def plot_cost(directory: Path) -> Path:
     return _save(figure, directory / "cost.png")
 
 
-def _read_columns(path: Path) -> dict[str, NDArray[np.float64]]:
+def read_table(path: Path) -> dict[str, NDArray[np.float64]]:
+    """The columns of pmf.csv or cost.csv, {name: shape (lines,)}.
+
+    :raises HmtSlamError: where the file is missing or damaged.
+    """
     try:
-        return read_table(path)
+        with path.open(encoding="utf-8", newline="") as file:
+            names = next(csv.reader(file))
+            rows = [[float(text) for text in line] for line in csv.reader(file)]
+        columns = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
     except (OSError, ValueError, StopIteration) as fault:
         raise HmtSlamError(f"{path} is missing or damaged: map the log again") from fault
+    return {name: columns[:, k] for k, name in enumerate(names)}
 
 
 def _color_of(number: int) -> Color:
-    """Colors of neighboring numbers are far apart: hues by the golden section, in two shades."""
+    """The color of an area or hypothesis: hues by the golden section, in two shades."""
     return colorsys.hsv_to_rgb((0.58 + number * _GOLDEN) % 1.0, 0.85, 0.85 if number % 2 else 0.65)
 
 

@@ -1,13 +1,12 @@
-"""What the output folder needs of a run so far, without the messages from which it came."""
+"""The record of a run: the tables and maps from which the output folder is written."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeVar
+from typing import NamedTuple, Self, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.geometry import se2
@@ -18,22 +17,8 @@ from hmt_slam_ros.messages.replica import ReplicaState
 from hmt_slam_ros.results.trajectories import OnlineEstimate
 
 
-@dataclass(frozen=True)
-class TopologyProbability:
-    """P(gamma^t | d), Eq. (14), of one live topology at one keyframe event.
-
-    :ivar keyframe: the keyframe event.
-    :ivar stamp: of its scan, ns.
-    :ivar path_length: path length since the start, m.
-    :ivar hypothesis: id of the topology.
-    :ivar parent: id before the event.
-    :ivar probability: as TSBI gave it.
-    :ivar area: the robot's area.
-    :ivar areas: number of areas of the topology.
-    :ivar closures: number of arcs that closed a loop.
-    :ivar accepted: whether TLCA made this topology definite at this event.
-    :ivar unexamined: probability of topologies not among the live ones.
-    """
+class TopologyProbability(NamedTuple):
+    """A row of :class:`ProbabilityTable`, which describes the fields."""
 
     keyframe: int
     stamp: int
@@ -49,20 +34,34 @@ class TopologyProbability:
 
 
 @dataclass(frozen=True, eq=False)
-class ProbabilityTable:
-    """The probabilities of all live topologies at all keyframe events, each column of shape (n,).
+class Table:
+    """Columns as arrays."""
 
-    :ivar keyframe: the keyframe event.
-    :ivar stamp: of its scan, ns.
+    def concatenate(self, later: Self) -> Self:
+        """The rows of this table, then those of another."""
+        return type(self)(*(np.concatenate((getattr(self, c.name), getattr(later, c.name))) for c in fields(self)))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the columns, bytes."""
+        return sum(getattr(self, column.name).nbytes for column in fields(self))
+
+
+@dataclass(frozen=True, eq=False)
+class ProbabilityTable(Table):
+    """Probabilities of all hypotheses at all keyframe events, Eq. (14); each column has shape (n,).
+
+    :ivar keyframe: number of the keyframe event.
+    :ivar stamp: stamp of its scan, ns.
     :ivar path_length: path length since the start, m.
-    :ivar hypothesis: id of the topology.
-    :ivar parent: id before the event.
-    :ivar probability: as TSBI gave it.
+    :ivar hypothesis: id of the hypothesis.
+    :ivar parent: id of the hypothesis that it continues.
+    :ivar probability: P(gamma^t | d).
     :ivar area: the robot's area.
-    :ivar areas: number of areas of the topology.
+    :ivar areas: number of areas.
     :ivar closures: number of arcs that closed a loop.
-    :ivar accepted: whether TLCA made this topology definite at this event.
-    :ivar unexamined: probability of topologies not among the live ones.
+    :ivar accepted: whether TLCA made the hypothesis definite at this event.
+    :ivar unexamined: probability of the topologies that are not among the hypotheses.
     """
 
     keyframe: Int64
@@ -79,28 +78,20 @@ class ProbabilityTable:
 
     @classmethod
     def from_rows(cls, rows: Iterable[TopologyProbability] = ()) -> ProbabilityTable:
-        """Of some rows."""
-        kept = list(rows)
-        kinds = {"int": np.int64, "float": np.float64, "bool": np.bool_}
-        columns: dict[str, Any] = {
-            entry.name: np.array([getattr(row, entry.name) for row in kept], dtype=kinds[str(entry.type)])
-            for entry in fields(TopologyProbability)
-        }
-        return cls(**columns)
-
-    def concatenate(self, later: ProbabilityTable) -> ProbabilityTable:
-        """With those of later events."""
-        return ProbabilityTable(*_concatenate_columns(self, later))
+        """The table of rows."""
+        kinds = get_type_hints(TopologyProbability).values()
+        columns = list(zip(*rows, strict=True)) or [()] * len(kinds)
+        return cls(*(np.array(column, dtype=kind) for column, kind in zip(columns, kinds, strict=True)))
 
     def rows(self) -> list[TopologyProbability]:
-        """Its rows."""
+        """The rows."""
         columns = [getattr(self, entry.name).tolist() for entry in fields(self)]
         return [TopologyProbability(*row) for row in zip(*columns, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
-class EstimateTable:
-    """What metric SLAM said of every scan, in their order.
+class EstimateTable(Table):
+    """Estimates of metric SLAM for all scans, in their order.
 
     :ivar scans: shape (n,), number of the scan.
     :ivar stamps: shape (n,), ns.
@@ -117,7 +108,7 @@ class EstimateTable:
 
     @classmethod
     def from_estimates(cls, estimates: Mapping[int, OnlineEstimate]) -> EstimateTable:
-        """Of {number of the scan: what was said of it}."""
+        """The table of {number of the scan: estimate}."""
         numbers = sorted(estimates)
         rows = [estimates[number] for number in numbers]
         return cls(
@@ -128,19 +119,15 @@ class EstimateTable:
             np.array([row.odometry for row in rows]).reshape(-1, 3),
         )
 
-    def concatenate(self, later: EstimateTable) -> EstimateTable:
-        """With those of later scans."""
-        return EstimateTable(*_concatenate_columns(self, later))
-
 
 @dataclass(frozen=True, eq=False)
-class ScanPoseTable:
-    """Where scans were taken, under one hypothesis or another, one trail after the other.
+class ScanPoseTable(Table):
+    """The messages ``ScanPoses`` of all hypotheses, one after the other.
 
-    :ivar hypotheses: shape (n,), of each trail.
-    :ivar first_scans: shape (n,), number of the first scan of each.
-    :ivar sizes: shape (n,), how many scans each has.
-    :ivar stamps: shape (sum of the sizes,), of the scans, ns.
+    :ivar hypotheses: shape (n,), hypothesis of each message.
+    :ivar first_scans: shape (n,), number of the first scan of each message.
+    :ivar sizes: shape (n,), number of scans of each message.
+    :ivar stamps: shape (sum of the sizes,), stamps of the scans, ns.
     :ivar keyframes: shape (sum of the sizes,), the stored keyframe to which a scan's pose is relative.
     :ivar poses: shape (sum of the sizes, 3), ``keyframe_T_base``, m and rad.
     """
@@ -153,24 +140,20 @@ class ScanPoseTable:
     poses: Float64
 
     @classmethod
-    def from_messages(cls, trails: Iterable[ScanPoses] = ()) -> ScanPoseTable:
-        """Of some trails."""
-        kept = list(trails)
+    def from_messages(cls, messages: Iterable[ScanPoses] = ()) -> ScanPoseTable:
+        """The table of messages."""
+        kept = list(messages)
         return cls(
-            np.array([trail.hypothesis for trail in kept], dtype=np.int64),
-            np.array([trail.first_scan for trail in kept], dtype=np.int64),
-            np.array([trail.stamps.size for trail in kept], dtype=np.int64),
-            np.concatenate([np.zeros(0, np.int64), *(trail.stamps for trail in kept)]),
-            np.concatenate([np.zeros(0, np.int64), *(trail.keyframes for trail in kept)]),
-            np.concatenate([np.zeros((0, 3)), *(trail.poses for trail in kept)]),
+            np.array([message.hypothesis for message in kept], dtype=np.int64),
+            np.array([message.first_scan for message in kept], dtype=np.int64),
+            np.array([message.stamps.size for message in kept], dtype=np.int64),
+            np.concatenate([np.zeros(0, np.int64), *(message.stamps for message in kept)]),
+            np.concatenate([np.zeros(0, np.int64), *(message.keyframes for message in kept)]),
+            np.concatenate([np.zeros((0, 3)), *(message.poses for message in kept)]),
         )
 
-    def concatenate(self, later: ScanPoseTable) -> ScanPoseTable:
-        """With other trails."""
-        return ScanPoseTable(*_concatenate_columns(self, later))
-
     def select_hypotheses(self, hypotheses: Collection[int]) -> ScanPoseTable:
-        """Those of some hypotheses alone."""
+        """The messages of some hypotheses."""
         kept = np.isin(self.hypotheses, list(hypotheses))
         scans = np.repeat(kept, self.sizes)
         return ScanPoseTable(
@@ -183,51 +166,43 @@ class ScanPoseTable:
         )
 
     def replace_pruned(self, successors: Mapping[int, ReplacementKeyframe]) -> ScanPoseTable:
-        """With scans that are related to forgotten keyframes related to others.
+        """The table with poses relative to pruned keyframes made relative to their replacements.
 
-        :param successors: {forgotten keyframe: the one instead}, in the order in which they were forgotten.
+        :param successors: {pruned keyframe: replacement}, in the order of pruning.
         """
         if not successors:
             return self
         anchors, poses = self.keyframes.copy(), self.poses.copy()
-        for gone, held in successors.items():
-            rows = np.flatnonzero(anchors == gone)
-            anchors[rows], poses[rows] = held.keyframe, se2.compose(held.pose, poses[rows])
+        for pruned, replacement in successors.items():
+            rows = np.flatnonzero(anchors == pruned)
+            anchors[rows], poses[rows] = replacement.keyframe, se2.compose(replacement.pose, poses[rows])
         return replace(self, keyframes=anchors, poses=poses)
 
     def to_messages(self) -> list[ScanPoses]:
-        """The trails."""
+        """The messages."""
         ends = np.cumsum(self.sizes)
-        heads = zip(self.hypotheses.tolist(), self.first_scans.tolist(), ends - self.sizes, ends, strict=True)
+        headers = zip(self.hypotheses.tolist(), self.first_scans.tolist(), ends - self.sizes, ends, strict=True)
         return [
             ScanPoses(hypothesis, first, self.stamps[begin:end], self.keyframes[begin:end], self.poses[begin:end])
-            for hypothesis, first, begin, end in heads
+            for hypothesis, first, begin, end in headers
         ]
-
-
-Table = TypeVar("Table", ProbabilityTable, EstimateTable, ScanPoseTable)
-
-
-def _concatenate_columns(table: Table, later: Table) -> list[NDArray[Any]]:
-    """The columns of two tables, one after the other."""
-    return [np.concatenate((getattr(table, entry.name), getattr(later, entry.name))) for entry in fields(table)]
 
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """A run up to some moment between two keyframe events.
+    """The record of a run up to a moment between two keyframe events.
 
-    :ivar events: keyframe events.
+    :ivar events: number of keyframe events.
     :ivar replica: the maps of the live hypotheses.
     :ivar map_sizes: {hypothesis: numbers of its areas and of its arcs that closed a loop}.
     :ivar parents: {hypothesis: the one from which it branched}, of the live ones and their ancestors.
-    :ivar probabilities: of every live topology at every keyframe event, in their order.
-    :ivar global_poses: ``map_T_area`` as TLCA told it last, ordered by area.
-    :ivar scan_poses: where scans were taken, of the live hypotheses and their ancestors.
-    :ivar estimates: what metric SLAM said of every scan.
-    :ivar online_trajectory: shape (n, 3), ``map_T_base`` of these scans as it was known at the time.
-    :ivar last_estimate: the last of what metric SLAM said, None before the first.
-    :ivar notices: what the processes had to tell a person.
+    :ivar probabilities: probability of every hypothesis at every keyframe event, in their order.
+    :ivar global_poses: the last ``map_T_area`` from TLCA, ordered by area.
+    :ivar scan_poses: poses of the scans, of the live hypotheses and their ancestors.
+    :ivar estimates: estimates of metric SLAM for all scans.
+    :ivar online_trajectory: shape (n, 3), ``map_T_base`` of these scans as it was estimated at their time.
+    :ivar last_estimate: the last estimate of metric SLAM, None before the first.
+    :ivar notices: notices of the processes.
     """
 
     events: int = 0
@@ -244,20 +219,18 @@ class RunRecord:
 
     @property
     def table_bytes(self) -> int:
-        """What the tables take, which grow with every scan and every keyframe event."""
+        """Memory of the tables, which grow with every scan and every keyframe event, bytes."""
         tables = (self.probabilities, self.scan_poses, self.estimates)
-        columns = [getattr(table, entry.name) for table in tables for entry in fields(table)]
-        return self.online_trajectory.nbytes + sum(column.nbytes for column in columns)
+        return self.online_trajectory.nbytes + sum(table.nbytes for table in tables)
 
     def lineage(self, hypothesis: int) -> list[int]:
-        """A hypothesis and its ancestors; ids are never used twice."""
-        found = [hypothesis]
-        while found[-1] in self.parents:
-            found.append(self.parents[found[-1]])
-        return found
+        """A hypothesis and its ancestors, the newest first. Ids are unique in a run."""
+        lineage = [hypothesis]
+        while lineage[-1] in self.parents:
+            lineage.append(self.parents[lineage[-1]])
+        return lineage
 
     def lineage_scan_poses(self, hypothesis: int) -> list[ScanPoses]:
-        """The trails of a hypothesis and of its ancestors, in the order of their scans."""
-        lineage = set(self.lineage(hypothesis))
-        own = (trail for trail in self.scan_poses.to_messages() if trail.hypothesis in lineage)
-        return sorted(own, key=lambda trail: (trail.first_scan, trail.hypothesis))
+        """The messages of a hypothesis and of its ancestors, in the order of their scans."""
+        messages = self.scan_poses.select_hypotheses(self.lineage(hypothesis)).to_messages()
+        return sorted(messages, key=lambda message: (message.first_scan, message.hypothesis))

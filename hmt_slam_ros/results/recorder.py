@@ -1,7 +1,7 @@
-"""The recorder listens to the processes and keeps what the output folder needs.
+"""The recorder: receives the messages of the processes and keeps what the output folder needs.
 
-Messages are filed by their own numbers, so that the order in which they arrive from several OS processes does not
-matter; :meth:`Recorder.finish` then goes through the keyframe events in their order.
+It stores messages by their numbers, so that their order of arrival from several OS processes does not matter.
+:meth:`Recorder.finish` then applies the keyframe events in their order.
 """
 
 from __future__ import annotations
@@ -37,36 +37,36 @@ from hmt_slam_ros.results.record import EstimateTable, ProbabilityTable, RunReco
 from hmt_slam_ros.results.trajectories import (
     AreaPoseUpdate,
     OnlineEstimate,
-    OnlineTrajectory,
     RelativeTrajectory,
     Trajectory,
     complete_trajectory,
+    online_trajectory,
     relative_trajectory_of,
     trajectory_in_map,
 )
 
-# Keyframe events whose messages are kept at least, and as a share of all before: a record is written anew as a whole.
 _MIN_EVENTS, _EVENT_SHARE = 64, 32
+"""Least number of keyframe events, and inverse of their share of all, after which messages become a record."""
 
 Numbered = TypeVar("Numbered", Keyframe, Hypotheses, ClosureDecision)
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a run came to.
+    """The results of a run.
 
     :ivar replica: scans and maps of the hypotheses that are alive at the end.
     :ivar area_poses: {area: belief over ``map_T_area``} of the most probable hypothesis.
-    :ivar stamps: shape (n,), of all scans of all logs, ns, increasing.
+    :ivar stamps: shape (n,), stamps of all scans of all logs, ns, increasing.
     :ivar first_scans: number of the first scan of each log.
     :ivar relative_trajectory: the scans relative to the keyframes of the most probable hypothesis.
     :ivar odometry: ``odom_T_base`` of the scans.
     :ivar trajectory: ``map_T_base`` of the scans in the map.
-    :ivar online_trajectory: the same as it was known when the scan was taken.
-    :ivar probabilities: of every live topology at every keyframe event, in their order.
+    :ivar online_trajectory: ``map_T_base`` of the scans as it was estimated at their time.
+    :ivar probabilities: probability of every hypothesis at every keyframe event, in their order.
     :ivar last_estimate: the last estimate of metric SLAM.
     :ivar totals: scans received, processed and dropped.
-    :ivar notices: what the processes had to tell a person.
+    :ivar notices: notices of the processes.
     """
 
     replica: Replica
@@ -90,15 +90,15 @@ class Recording:
 
 @dataclass
 class Recorder:
-    """Value machine that answers nothing and remembers everything.
+    """A value machine that records messages and sends none.
 
-    :ivar configuration: that of the run, which goes into the output.
-    :ivar earlier_record: what was recorded before the run, if it goes on from there.
-    :ivar keyframes: {keyframe event: message}, likewise ``hypotheses`` and ``accepted``.
+    :ivar configuration: configuration of the run.
+    :ivar earlier_record: the record up to the first of the messages below.
+    :ivar keyframes: {keyframe event: message}, as ``hypotheses`` and ``decisions``.
     :ivar scan_poses: {(hypothesis, first scan): message}.
-    :ivar estimates: {scan index: what is kept of the message}; ``last``, the message of the last scan.
+    :ivar estimates: {scan index: part of the message}; ``last_estimate`` is the message of the last scan.
     :ivar notices: {(process, text): message} in the order of arrival.
-    :ivar end_of_run: the last word of metric SLAM, None before it.
+    :ivar end_of_run: last message of metric SLAM, None before it.
     """
 
     configuration: Configuration
@@ -117,7 +117,7 @@ class Recorder:
         self.notices = {(notice.process, notice.text): notice for notice in self.earlier_record.notices}
 
     def handle(self, message: Message) -> list[Message]:
-        """File a message; one that comes twice counts once."""
+        """Store a message; a repeated message is ignored."""
         match message:
             case Keyframe():
                 self.keyframes.setdefault(message.sequence, message)
@@ -136,15 +136,15 @@ class Recorder:
         return []
 
     def _add_estimate(self, message: LocalEstimate) -> None:
-        # The pose is one of all particles', which a view of it would keep.
-        kept = OnlineEstimate(message.stamp, message.area, message.pose.mean.copy(), message.odometry)
-        self.estimates.setdefault(message.scan_index, kept)
+        # The mean is a view of the poses of all particles: a copy releases them.
+        estimate = OnlineEstimate(message.stamp, message.area, message.pose.mean.copy(), message.odometry)
+        self.estimates.setdefault(message.scan_index, estimate)
         if self.last_estimate is None or message.scan_index > self.last_estimate.scan_index:
             self.last_estimate = message
 
     @property
     def is_complete(self) -> bool:
-        """Whether the end has been heard and nothing is still on its way."""
+        """Whether the end of the run and all messages before it have arrived."""
         events, estimates = len(self.keyframes), len(self.earlier_record.estimates.scans) + len(self.estimates)
         return (
             self.end_of_run is not None
@@ -153,45 +153,45 @@ class Recorder:
         )
 
     def record(self) -> RunRecord:
-        """All that was heard up to now, when the answers to all keyframe events are here.
+        """The record up to now. The answers to all keyframe events must have arrived.
 
-        :raises HmtSlamError: where messages were lost on the way.
+        :raises HmtSlamError: where a message was lost.
         """
         past, first = self.earlier_record, self.earlier_record.events
         events = 1 + max([first - 1, *self.keyframes, *self.hypotheses, *self.decisions])
         keyframes = _ordered_messages("Keyframe", self.keyframes, first, events)
         hypotheses = _ordered_messages("Hypotheses", self.hypotheses, first, events)
-        accepted = _ordered_messages("ClosureDecision", self.decisions, first, events)
-        replica, sizes, probabilities, successors = _replay(past, keyframes, hypotheses, accepted)
-        branched = {leaf.id: leaf.parent for message in hypotheses for leaf in _new_branches(message)}
-        given = [verdict.global_poses for verdict in accepted if verdict.global_poses]
-        found = replace(
+        decisions = _ordered_messages("ClosureDecision", self.decisions, first, events)
+        replica, sizes, probabilities, successors = _replay(past, keyframes, hypotheses, decisions)
+        branched = {h.id: h.parent for message in hypotheses for h in message.hypotheses if h.id != h.parent}
+        global_poses = [decision.global_poses for decision in decisions if decision.global_poses]
+        record = replace(
             past,
             events=events,
             replica=replica.state,
             map_sizes=sizes,
             parents={**past.parents, **branched},
             probabilities=past.probabilities.concatenate(ProbabilityTable.from_rows(probabilities)),
-            global_poses=given[-1] if given else past.global_poses,
+            global_poses=global_poses[-1] if global_poses else past.global_poses,
             estimates=past.estimates.concatenate(EstimateTable.from_estimates(self.estimates)),
-            online_trajectory=np.concatenate((past.online_trajectory, self._online_trajectory(keyframes, accepted))),
+            online_trajectory=np.concatenate((past.online_trajectory, self._online_trajectory(keyframes, decisions))),
             last_estimate=self.last_estimate
             if self.last_estimate is None or not hypotheses
             else _follow_area_merge(self.last_estimate, hypotheses[-1]),
             notices=tuple(self.notices.values()),
         )
-        alive = {known for hypothesis in replica.maps for known in found.lineage(hypothesis)}
-        trails = past.scan_poses.concatenate(ScanPoseTable.from_messages(self.scan_poses.values()))
+        alive = {ancestor for hypothesis in replica.maps for ancestor in record.lineage(hypothesis)}
+        scan_poses = past.scan_poses.concatenate(ScanPoseTable.from_messages(self.scan_poses.values()))
         return replace(
-            found,
-            parents={child: parent for child, parent in found.parents.items() if child in alive},
-            scan_poses=trails.select_hypotheses(alive).replace_pruned(successors),
+            record,
+            parents={child: parent for child, parent in record.parents.items() if child in alive},
+            scan_poses=scan_poses.select_hypotheses(alive).replace_pruned(successors),
         )
 
     def compact(self) -> None:
-        """Keep a record of what was heard instead of the messages, if these are many by now.
+        """Replace the messages by a record where they are many: they take ten times as much memory.
 
-        They take ten times as much memory. To be called when the answers to all keyframe events are here.
+        The answers to all keyframe events must have arrived.
         """
         if len(self.decisions) < max(_MIN_EVENTS, self.earlier_record.events // _EVENT_SHARE):
             return
@@ -199,27 +199,30 @@ class Recorder:
         for messages in (self.keyframes, self.hypotheses, self.decisions, self.scan_poses, self.estimates):
             messages.clear()
 
-    def _online_trajectory(self, keyframes: list[Keyframe], accepted: list[ClosureDecision]) -> Trajectory:
-        """The poses of the scans that came since the past."""
+    def _online_trajectory(self, keyframes: list[Keyframe], decisions: list[ClosureDecision]) -> Trajectory:
+        """The poses of the scans since the earlier record."""
         past = self.earlier_record
-        before = None if not past.online_trajectory.size else (past.online_trajectory[-1], past.estimates.odometry[-1])
-        verdicts = [
-            AreaPoseUpdate(keyframe.scan.stamp, {entry.area: entry.pose.mean for entry in verdict.global_poses})
-            for keyframe, verdict in zip(keyframes, accepted, strict=True)
+        previous = (
+            None if not past.online_trajectory.size else (past.online_trajectory[-1], past.estimates.odometry[-1])
+        )
+        updates = [
+            AreaPoseUpdate(keyframe.scan.stamp, {entry.area: entry.pose.mean for entry in decision.global_poses})
+            for keyframe, decision in zip(keyframes, decisions, strict=True)
         ]
-        poses = OnlineTrajectory({entry.area: entry.pose.mean for entry in past.global_poses}, before)
-        return poses.advance([self.estimates[scan] for scan in sorted(self.estimates)], verdicts)
+        estimates = [self.estimates[scan] for scan in sorted(self.estimates)]
+        area_poses = {entry.area: entry.pose.mean for entry in past.global_poses}
+        return online_trajectory(estimates, updates, area_poses, previous)
 
     def finish(
         self, stamps: NDArray[np.int64], first_scans: tuple[int, ...] = (0,), earlier: RelativeTrajectory | None = None
     ) -> Recording:
-        """Work out the final map, trajectories and probabilities.
+        """The results of the run: maps, trajectories and probabilities.
 
-        :param stamps: shape (n,), stamps of all scans as the processes got them, ns, increasing; the trajectories have
-            a pose for each.
-        :param first_scans: number of the first scan of each log, where they are of several.
-        :param earlier: where scans of earlier logs were taken after the final refinement of that time.
-        :raises HmtSlamError: where no scan gave a pose, or messages were lost on the way.
+        :param stamps: shape (n,), stamps of all scans as the processes received them, ns, increasing; the trajectories
+            have a pose for each.
+        :param first_scans: number of the first scan of each log.
+        :param earlier: refined trajectory of the earlier logs.
+        :raises HmtSlamError: where no scan has a pose, or a message was lost.
         """
         if self.last_estimate is None or self.end_of_run is None or not (self.keyframes or self.earlier_record.events):
             raise HmtSlamError(
@@ -228,7 +231,7 @@ class Recorder:
             )
         record = self.record()
         assert record.last_estimate is not None
-        replica, given = Replica.from_state(record.replica), record.estimates
+        replica, estimates = Replica.from_state(record.replica), record.estimates
         area_poses = complete_area_poses(replica.maps[replica.best_hypothesis], record.global_poses)
         poses = keyframe_poses(replica.maps[replica.best_hypothesis], area_poses)
         scans = relative_trajectory_of(stamps, record.lineage_scan_poses(replica.best_hypothesis)).replace_start(
@@ -240,9 +243,9 @@ class Recorder:
             stamps,
             first_scans,
             scans,
-            complete_trajectory(stamps, given.stamps, given.odometry),
+            complete_trajectory(stamps, estimates.stamps, estimates.odometry),
             trajectory_in_map(scans, poses),
-            complete_trajectory(stamps, given.stamps, record.online_trajectory),
+            complete_trajectory(stamps, estimates.stamps, record.online_trajectory),
             record.probabilities.rows(),
             record.last_estimate,
             self.end_of_run,
@@ -251,15 +254,11 @@ class Recorder:
 
 
 def _follow_area_merge(last: LocalEstimate, newest: Hypotheses) -> LocalEstimate:
-    """The last estimate, where its area became part of another since in the frame of that one."""
-    for leaf in newest.hypotheses:
-        if leaf.area_merge is not None and leaf.area_merge.area == last.area:
-            return replace(last, area=leaf.area_merge.into, pose=leaf.area_merge.pose.compose(last.pose))
+    """The last estimate, in the frame of the merged area where its area was merged into another."""
+    for merge in (hypothesis.area_merge for hypothesis in newest.hypotheses):
+        if merge is not None and merge.area == last.area:
+            return replace(last, area=merge.into, pose=merge.pose.compose(last.pose))
     return last
-
-
-def _new_branches(message: Hypotheses) -> list[Hypothesis]:
-    return [leaf for leaf in message.hypotheses if leaf.id != leaf.parent]
 
 
 def _ordered_messages(name: str, messages: dict[int, Numbered], first: int, events: int) -> list[Numbered]:
@@ -272,60 +271,62 @@ def _ordered_messages(name: str, messages: dict[int, Numbered], first: int, even
 
 
 def _replay(
-    past: RunRecord, keyframes: list[Keyframe], hypotheses: list[Hypotheses], accepted: list[ClosureDecision]
+    past: RunRecord, keyframes: list[Keyframe], hypotheses: list[Hypotheses], decisions: list[ClosureDecision]
 ) -> tuple[Replica, Mapping[int, tuple[int, int]], list[TopologyProbability], dict[int, ReplacementKeyframe]]:
-    """The maps after some events, their numbers of areas and loop closures, and the probabilities at the events.
+    """The maps after the events, their numbers of areas and loop closures, the probabilities at the events.
 
-    Last, in their order, the keyframes that were forgotten and those that stand for them since then.
+    The last value is {pruned keyframe: replacement}, in the order of pruning.
     """
     replica, sizes, probabilities = Replica.from_state(past.replica), past.map_sizes, list[TopologyProbability]()
     successors: dict[int, ReplacementKeyframe] = {}
-    for keyframe, belief, verdict in zip(keyframes, hypotheses, accepted, strict=True):
+    for keyframe, message, decision in zip(keyframes, hypotheses, decisions, strict=True):
         replica.add_keyframe(keyframe)
-        successors |= _successors(replica, belief.pruned_keyframes)
-        replica.apply_hypotheses(belief)
-        sizes = {leaf.id: _map_size(replica, leaf, sizes) for leaf in belief.hypotheses}
+        successors |= _successors(replica, message.pruned_keyframes)
+        replica.apply_hypotheses(message)
+        sizes = {h.id: _map_size(replica, h, sizes) for h in message.hypotheses}
         probabilities += [
             TopologyProbability(
                 keyframe.sequence,
                 keyframe.scan.stamp,
                 keyframe.path_length,
-                leaf.id,
-                leaf.parent,
-                leaf.probability,
-                leaf.area,
-                *sizes[leaf.id],
-                leaf.id == verdict.hypothesis,
-                belief.unexamined,
+                h.id,
+                h.parent,
+                h.probability,
+                h.area,
+                *sizes[h.id],
+                h.id == decision.hypothesis,
+                message.unexamined,
             )
-            for leaf in belief.hypotheses
+            for h in message.hypotheses
         ]
-        replica.apply_decision(verdict)
+        replica.apply_decision(decision)
     return replica, sizes, probabilities, successors
 
 
-def _successors(replica: Replica, forgotten: Sequence[PrunedKeyframe]) -> dict[int, ReplacementKeyframe]:
-    """{keyframe that is forgotten: the one that stands for it}, of the one hypothesis that there is then."""
-    gone, hybrid_map = {one.keyframe for one in forgotten}, replica.maps[replica.best_hypothesis]
-    found = {}
-    for one in forgotten:
-        placed = hybrid_map.keyframes(one.area)
-        found[one.keyframe] = nearest_replacement(
-            placed[one.keyframe], {k: at for k, at in placed.items() if k not in gone}
-        )
-    return found
+def _successors(replica: Replica, pruned: Sequence[PrunedKeyframe]) -> dict[int, ReplacementKeyframe]:
+    """{pruned keyframe: replacement}. Keyframes are pruned only where there is one hypothesis."""
+    numbers, hybrid_map = {entry.keyframe for entry in pruned}, replica.maps[replica.best_hypothesis]
+    replacements = {}
+    for entry in pruned:
+        poses = hybrid_map.keyframes(entry.area)
+        remaining = {keyframe: pose for keyframe, pose in poses.items() if keyframe not in numbers}
+        replacements[entry.keyframe] = nearest_replacement(poses[entry.keyframe], remaining)
+    return replacements
 
 
-def _map_size(replica: Replica, leaf: Hypothesis, sizes: Mapping[int, tuple[int, int]]) -> tuple[int, int]:
-    """Areas and loop closures of a leaf, counted anew only where the leaf changed."""
-    if leaf.id in sizes and not (leaf.arcs or leaf.moved_keyframes or leaf.removed_arcs or leaf.area_merge):
-        return sizes[leaf.id]
-    hybrid_map = replica.maps[leaf.id]
+def _map_size(replica: Replica, h: Hypothesis, sizes: Mapping[int, tuple[int, int]]) -> tuple[int, int]:
+    """Numbers of areas and loop closures of a hypothesis, counted again only where its map changed."""
+    if h.id in sizes and not (h.arcs or h.moved_keyframes or h.removed_arcs or h.area_merge):
+        return sizes[h.id]
+    hybrid_map = replica.maps[h.id]
     return len(hybrid_map.area_ids()), sum(arc.closure for _, _, arc in hybrid_map.all_arcs())
 
 
 def complete_area_poses(hybrid_map: HybridMap, given: Sequence[AreaPose]) -> dict[int, PoseGaussian]:
-    """``map_T_area`` of every area: as TLCA last gave it, else along the arcs from an area that TLCA did give."""
+    """``map_T_area`` of every area: the given one, else along the arcs from an area with a given one.
+
+    :param given: the last global poses from TLCA.
+    """
     known = {entry.area: entry.pose for entry in given}
     areas = hybrid_map.area_ids()
     start = next((area for area in areas if area in known), areas[0])

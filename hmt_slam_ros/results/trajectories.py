@@ -1,4 +1,4 @@
-"""A pose for every scan of the log, in the final map and as it was known at the time."""
+"""Trajectories: a pose for every scan, in the final map and as it was estimated at the time of the scan."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ Trajectory = NDArray[np.float64]
 
 
 class RelativeTrajectory(NamedTuple):
-    """Where the scans of a log were taken, relative to keyframes.
+    """Poses of scans relative to keyframes.
 
-    :ivar keyframes: shape (n,), the keyframe to which a scan is related, -1 for none.
+    :ivar keyframes: shape (n,), reference keyframe of each scan, -1 for none.
     :ivar poses: shape (n, 3), ``keyframe_T_base``, m and rad.
     """
 
@@ -30,11 +30,15 @@ class RelativeTrajectory(NamedTuple):
 
     @classmethod
     def empty(cls) -> RelativeTrajectory:
-        """Of no scan."""
+        """The trajectory of no scan."""
         return cls(np.zeros(0, np.int64), np.zeros((0, 3)))
 
     def replace_start(self, better: RelativeTrajectory, known: Collection[int]) -> RelativeTrajectory:
-        """The same with the first scans where they are better known to be, relative to keyframes that are known."""
+        """The trajectory with the poses of its first scans taken from another one.
+
+        :param better: refined trajectory of the first scans.
+        :param known: keyframes that exist; scans relative to others keep their poses.
+        """
         keyframes, poses = self.keyframes.copy(), self.poses.copy()
         rows = np.flatnonzero(np.isin(better.keyframes, list(known)))
         keyframes[rows], poses[rows] = better.keyframes[rows], better.poses[rows]
@@ -43,7 +47,7 @@ class RelativeTrajectory(NamedTuple):
     def with_trajectory(
         self, trajectory: Trajectory, keyframes: Mapping[int, NDArray[np.float64]]
     ) -> RelativeTrajectory:
-        """The same scans where a trajectory has them.
+        """The same reference keyframes with the poses of a trajectory.
 
         :param keyframes: {keyframe: ``map_T_base``, shape (3,)}.
         """
@@ -54,10 +58,10 @@ class RelativeTrajectory(NamedTuple):
 
 
 class OnlineEstimate(NamedTuple):
-    """What is kept of a ``LocalEstimate``.
+    """The part of a ``LocalEstimate`` that is recorded.
 
-    :ivar stamp: the scan's, ns.
-    :ivar area: the robot's.
+    :ivar stamp: stamp of the scan, ns.
+    :ivar area: the robot's area.
     :ivar pose: shape (3,), ``area_T_base``.
     :ivar odometry: shape (3,), ``odom_T_base``.
     """
@@ -68,24 +72,24 @@ class OnlineEstimate(NamedTuple):
     odometry: NDArray[np.float64]
 
 
-def relative_trajectory_of(stamps: NDArray[np.int64], trails: Sequence[ScanPoses]) -> RelativeTrajectory:
-    """The scans of one hypothesis relative to its keyframes.
+def relative_trajectory_of(stamps: NDArray[np.int64], messages: Sequence[ScanPoses]) -> RelativeTrajectory:
+    """The trajectory of one hypothesis relative to its keyframes.
 
-    :param stamps: shape (n,), of all scans, ns, increasing.
-    :param trails: of one hypothesis; where two speak of the same scan the later one counts.
-    :raises HmtSlamError: where no trail holds any scan.
+    :param stamps: shape (n,), stamps of all scans, ns, increasing.
+    :param messages: messages of that hypothesis and its ancestors; of two poses of a scan the later one counts.
+    :raises HmtSlamError: where the messages have no scan.
     """
     keyframes, poses = np.full(stamps.size, -1, dtype=np.int64), np.zeros((stamps.size, 3))
-    for trail in trails:
-        rows = _rows_of_stamps(stamps, trail.stamps)
-        keyframes[rows], poses[rows] = trail.keyframes, trail.poses
+    for message in messages:
+        rows = _rows_of_stamps(stamps, message.stamps)
+        keyframes[rows], poses[rows] = message.keyframes, message.poses
     if not (keyframes >= 0).any():
         raise HmtSlamError(f"none of the {len(poses)} scans gave a pose: check the ranges and the odometry of the log")
     return RelativeTrajectory(keyframes, poses)
 
 
 def trajectory_in_map(scans: RelativeTrajectory, keyframes: Mapping[int, NDArray[np.float64]]) -> Trajectory:
-    """``map_T_keyframe`` * ``keyframe_T_base`` of every scan.
+    """``map_T_base`` = ``map_T_keyframe`` * ``keyframe_T_base`` of every scan.
 
     :param keyframes: {keyframe: ``map_T_base``, shape (3,)}.
     """
@@ -97,74 +101,72 @@ def trajectory_in_map(scans: RelativeTrajectory, keyframes: Mapping[int, NDArray
 
 
 def complete_trajectory(stamps: NDArray[np.int64], given: NDArray[np.int64], poses: Trajectory) -> Trajectory:
-    """A pose for every scan, of which some are given.
+    """A pose for every scan, interpolated between given ones.
 
-    :param stamps: shape (n,), of all scans, ns, increasing.
-    :param given: shape (m,), stamps of those whose poses are given.
-    :param poses: shape (m, 3), these poses.
-    :raises HmtSlamError: where a stamp is of none of the scans, or no pose is given.
+    :param stamps: shape (n,), stamps of all scans, ns, increasing.
+    :param given: shape (m,), stamps of the scans with given poses.
+    :param poses: shape (m, 3), the given poses.
+    :raises HmtSlamError: where a given stamp belongs to no scan, or no pose is given.
     """
-    found = np.full((stamps.size, 3), np.nan)
-    found[_rows_of_stamps(stamps, given)] = poses
-    return _fill_gaps(found)
+    trajectory = np.full((stamps.size, 3), np.nan)
+    trajectory[_rows_of_stamps(stamps, given)] = poses
+    return _fill_gaps(trajectory)
 
 
 class AreaPoseUpdate(NamedTuple):
-    """TLCA's answer to a keyframe event.
+    """The poses of areas in TLCA's answer to a keyframe event.
 
-    :ivar stamp: of the keyframe's scan, ns.
-    :ivar area_poses: {area: ``map_T_area``, shape (3,)}, empty where they stay as they were.
+    :ivar stamp: stamp of the keyframe's scan, ns.
+    :ivar area_poses: {area: ``map_T_area``, shape (3,)}, empty where unchanged.
     """
 
     stamp: int
     area_poses: Mapping[int, NDArray[np.float64]]
 
 
-class OnlineTrajectory:
-    """``map_T_base`` of one scan after the other from what was known when it was taken.
+def online_trajectory(
+    estimates: Sequence[OnlineEstimate],
+    updates: Sequence[AreaPoseUpdate],
+    area_poses: Mapping[int, NDArray[np.float64]],
+    previous: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+) -> Trajectory:
+    """``map_T_base`` of scans as it was estimated at the time of each scan, shape (n, 3).
 
-    The verdict on a keyframe holds for the scans after it. In an area that no verdict has placed yet, the pose goes on
-    from the one before it along the odometry.
+    An update holds for the scans after its keyframe. In an area without a pose the odometry continues the last pose.
+
+    :param estimates: estimates of the n scans, in their order.
+    :param updates: poses of areas, in the order of their stamps.
+    :param area_poses: {area: ``map_T_area``} of the last update before these; empty before the first.
+    :param previous: ``map_T_base`` and ``odom_T_base``, shape (3,), of the scan before these; None before the first.
     """
-
-    def __init__(
-        self, areas: Mapping[int, NDArray[np.float64]], previous: tuple[NDArray[np.float64], NDArray[np.float64]] | None
-    ) -> None:
-        """:param areas: {area: ``map_T_area``}, of the last verdict that gave any; empty before the first.
-
-        :param previous: of the scan before, ``map_T_base`` and ``odom_T_base``, shape (3,); None before the first.
-        """
-        self._area_poses = areas or {FIRST_AREA: np.zeros(3)}
-        self._previous = previous
-
-    def advance(self, estimates: Sequence[OnlineEstimate], updates: Sequence[AreaPoseUpdate]) -> Trajectory:
-        """The poses of the scans to come, shape (n, 3)."""
-        poses, given = np.zeros((len(estimates), 3)), 0
-        for k, estimate in enumerate(estimates):
-            while given < len(updates) and updates[given].stamp < estimate.stamp:
-                self._area_poses = updates[given].area_poses or self._area_poses
-                given += 1
-            poses[k] = self._pose_in_map(estimate)
-            self._previous = (poses[k], estimate.odometry)
-        return poses
-
-    def _pose_in_map(self, estimate: OnlineEstimate) -> NDArray[np.float64]:
-        if estimate.area in self._area_poses or self._previous is None:
-            return se2.compose(self._area_poses.get(estimate.area, np.zeros(3)), estimate.pose)
-        return se2.compose(self._previous[0], se2.between(self._previous[1], estimate.odometry))
+    area_poses = area_poses or {FIRST_AREA: np.zeros(3)}
+    poses, applied = np.zeros((len(estimates), 3)), 0
+    for k, estimate in enumerate(estimates):
+        while applied < len(updates) and updates[applied].stamp < estimate.stamp:
+            area_poses = updates[applied].area_poses or area_poses
+            applied += 1
+        if estimate.area in area_poses or previous is None:
+            poses[k] = se2.compose(area_poses.get(estimate.area, np.zeros(3)), estimate.pose)
+        else:
+            poses[k] = se2.compose(previous[0], se2.between(previous[1], estimate.odometry))
+        previous = (poses[k], estimate.odometry)
+    return poses
 
 
 def _rows_of_stamps(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.intp]:
-    """The scans that have the given stamps."""
+    """Numbers of the scans with given stamps.
+
+    :raises HmtSlamError: where no scan has a given stamp.
+    """
     rows = np.minimum(np.searchsorted(stamps, wanted), stamps.size - 1)
-    strange = wanted[stamps[rows] != wanted]
-    if strange.size:
-        raise HmtSlamError(f"a scan of stamp {strange[0]} ns is not in the log: stop other sources of /scan")
+    unknown = wanted[stamps[rows] != wanted]
+    if unknown.size:
+        raise HmtSlamError(f"a scan of stamp {unknown[0]} ns is not in the log: stop other sources of /scan")
     return rows
 
 
 def _fill_gaps(poses: Trajectory) -> Trajectory:
-    """Scans without a pose get one between their neighbours in the log, or the nearest one at either end."""
+    """The poses with NaN replaced by interpolation between neighbors, or by the nearest pose at either end."""
     known = np.flatnonzero(~np.isnan(poses[:, 0]))
     if known.size == 0:
         raise HmtSlamError(f"none of the {len(poses)} scans gave a pose: check the ranges and the odometry of the log")

@@ -28,11 +28,11 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
 from hmt_slam_ros.doctor import running
-from hmt_slam_ros.doctor.examination import findings, sorted_findings
-from hmt_slam_ros.doctor.finding import Finding
-from hmt_slam_ros.doctor.gathering import Gatherer
+from hmt_slam_ros.doctor.examination import statistics_findings
+from hmt_slam_ros.doctor.finding import Finding, sorted_findings
+from hmt_slam_ros.doctor.frames import MessageStatistics, ScanHeader, TransformCollector
 from hmt_slam_ros.doctor.running import Mismatch, NodeStatus, RunningSystem, Topic
-from hmt_slam_ros.doctor.statistics import MessageStatistics, ScanHeader, TransformCollector
+from hmt_slam_ros.doctor.statistics import Gatherer
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.mounting import FrameTree, Mounting, frame_name, planar_mounting
 from hmt_slam_ros.logs.records import LogRecord
@@ -143,10 +143,10 @@ class DoctorNode(Node):
     def findings(self, seconds: float) -> list[Finding]:
         """All that was found."""
         system = self._running_system(seconds)
-        found = running.findings(system)
+        found = list(running.running_findings(system))
         if not system.topics[running.SCAN].message_count:
             return found
-        return [*found, *findings(self._gather().finish("the running system", self._message_statistics()))]
+        return [*found, *statistics_findings(self._gather().finish("the running system", self._message_statistics()))]
 
     def _on_scan(self, message: LaserScan) -> None:
         self._count_message(running.SCAN, conversions.stamp_from_time(message.header.stamp))

@@ -28,9 +28,8 @@ from hmt_slam_ros.logs import Log
 from hmt_slam_ros.open_log import is_simulated, open_log
 from hmt_slam_ros.process_table import COORDINATOR, consumer_count, node_command, process_names
 from hmt_slam_ros.results.final_map import deskewed_scans, final_map
-from hmt_slam_ros.results.output_folder import atomic_output, write_output
+from hmt_slam_ros.results.output_folder import RunMetrics, atomic_output, write_output
 from hmt_slam_ros.results.recorder import Recording
-from hmt_slam_ros.results.report import RunMetrics
 from hmt_slam_ros.ros.diagnostics import peak_rss
 from hmt_slam_ros.ros.domain import own_domain
 from hmt_slam_ros.ros.execution import PARENT_VARIABLE, wait_until_alone

@@ -1,1 +1,1 @@
-"""Values that outlast a process: a folder of documents and arrays, checked when it is read, replaced at one stroke."""
+"""Saved values: a folder of documents and arrays that is verified when read and replaced atomically."""

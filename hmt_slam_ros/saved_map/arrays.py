@@ -1,4 +1,4 @@
-"""Arrays beside the document that names them: one after the other in a file, little-endian, in C order."""
+"""Arrays of a document: one after the other in a binary file, little-endian, in C order."""
 
 from __future__ import annotations
 
@@ -13,43 +13,44 @@ from numpy.typing import NDArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.plain_data import Reader
 
-_ALIGNED = 8  # bytes
+_ALIGNMENT = 8
+"""Alignment of arrays in the file, bytes."""
 
 
 class Sink(Protocol):
-    """Takes bytes one after the other."""
+    """A file that bytes are appended to."""
 
     def write(self, content: bytes, /) -> object:
-        """Take some."""
+        """Append bytes."""
 
 
 class ArrayWriter:
-    """Takes the arrays of a document that is written: there they are {"type", "shape", "at"}, an offset in bytes."""
+    """Writes the arrays of a document, which has {"type", "shape", "at"} for each, with an offset in bytes."""
 
     def __init__(self, file: Sink) -> None:
-        """:param file: where the arrays go."""
+        """:param file: file for the arrays."""
         self._file = file
         self._size = 0
 
     def store(self, value: NDArray[Any]) -> object:
-        """Where an array is."""
+        """Write an array and return its entry in the document."""
         content = np.asarray(value, dtype=value.dtype.newbyteorder("<")).tobytes()
-        at = self._size
-        missing = -len(content) % _ALIGNED
-        self._file.write(content + bytes(missing))
-        self._size += len(content) + missing
-        return {"type": _dtype_name(value.dtype), "shape": list(value.shape), "at": at}
+        padded = content + bytes(-len(content) % _ALIGNMENT)
+        entry = {"type": _dtype_name(value.dtype), "shape": list(value.shape), "at": self._size}
+        self._file.write(padded)
+        self._size += len(padded)
+        return entry
 
 
 class ArrayReader:
-    """Finds the arrays of a document that is read."""
+    """Reads the arrays of a document."""
 
     def __init__(self, content: bytes) -> None:
-        """:param content: of the file."""
+        """:param content: content of the file."""
         self._content = content
 
-    def reader(self, field: str, kind: Hashable) -> Reader:  # noqa: ARG002  the annotation tells all
-        """What finds an array of the type that is annotated; each is a copy of its own."""
+    def reader(self, field: str, kind: Hashable) -> Reader:  # noqa: ARG002  the annotation has the type
+        """The reader of arrays with the annotated type; it makes copies."""
         wanted = np.dtype(get_args(get_args(kind)[1])[0])
         name, size = _dtype_name(wanted), wanted.itemsize
 

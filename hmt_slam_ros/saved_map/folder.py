@@ -1,7 +1,6 @@
-"""A folder of typed documents with a manifest that tells whether all is well, replaced at one stroke.
+"""A folder of typed documents with a manifest, replaced atomically.
 
-The manifest lists every file with its size and its SHA-256, and holds its own, so that nothing is read that is not what
-was written.
+The manifest lists every file with its size and SHA-256, and has an SHA-256 of its own. A reader verifies all of them.
 """
 
 from __future__ import annotations
@@ -27,29 +26,43 @@ from hmt_slam_ros.saved_map.scans import ScanReader, ScanTable, ScanWriter
 from hmt_slam_ros.sensors import Scan
 
 FORMAT, VERSION = "hmt_map", 18
+"""Format of a saved map, and the version of its documents."""
 
 HMT_MAP = "hmt_map"
-"""The folder in an output folder."""
+"""Folder of the map in an output folder."""
 
 CONFIGURATION = "configuration.yaml"
-"""The file of its parameters."""
+"""File of the parameters in a map."""
 
+MANIFEST = "manifest.json"
+"""File with size and SHA-256 of all other files."""
 
-_AT_FDCWD = -100  # AT_FDCWD: paths are relative to the working directory
-_RENAME_EXCHANGE = 2  # RENAME_EXCHANGE
+SCANS = "scans"
+"""Document of all scans."""
+
+FORMAT_DOC = "docs/reference/map_format.md"
+"""Description of the documents."""
+
+_REMEDY = "take a copy that is whole, or map the log again"
+"""Advice for a damaged folder."""
+
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+"""Arguments of renameat2(2): paths are relative to the working directory; exchange two names."""
+
+Document = TypeVar("Document")
 
 
 def replace_folder(new: Path, target: Path) -> None:
-    """Make a folder stand at ``target``; what stood there before then stands at ``new``.
+    """Exchange a folder with ``target``, or move it there where ``target`` does not exist.
 
-    :param new: on the same file system, written to the end.
-    :raises OSError: where that cannot be.
+    :param new: complete folder on the same file system.
+    :raises OSError: where the folder cannot be moved.
     """
     _flush(new)
     if not target.exists():
         new.rename(target)
     elif not _exchange(new, target):
-        # A file system that cannot exchange two names: for a moment there is none.
+        # The file system cannot exchange two names: for a moment, there is no target.
         aside = new.with_name(f"{new.name}.old")
         target.rename(aside)
         new.rename(target)
@@ -58,7 +71,7 @@ def replace_folder(new: Path, target: Path) -> None:
 
 
 def _exchange(one: Path, other: Path) -> bool:
-    """Whether two names were exchanged; not every file system can."""
+    """Exchange two names; returns False where the file system cannot."""
     libc = ctypes.CDLL(None, use_errno=True)
     if not hasattr(libc, "renameat2"):
         return False
@@ -71,7 +84,7 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 def _flush(folder: Path) -> None:
-    """See to it that a folder and all in it outlast a loss of power."""
+    """Flush a folder and all in it to the disk."""
     for entry in folder.iterdir():
         if entry.is_dir():
             _flush(entry)
@@ -89,21 +102,13 @@ def _flush_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-MANIFEST = "manifest.json"
-FORMAT_DOC = "docs/reference/map_format.md"
-SCANS = "scans"
-_REMEDY = "take a copy that is whole, or map the log again"
-
-Document = TypeVar("Document")
-
-
 @dataclass(frozen=True)
 class FileRecord:
-    """A file as it was written.
+    """A file of a folder.
 
-    :ivar name: its name in the folder.
-    :ivar size: its size.
-    :ivar sha256: its hash, hexadecimal.
+    :ivar name: name of the file.
+    :ivar size: size, bytes.
+    :ivar sha256: SHA-256 of its content, hexadecimal.
     """
 
     name: str
@@ -112,7 +117,7 @@ class FileRecord:
 
 
 class _HashingFile:
-    """A file that counts and hashes what is written to it."""
+    """A file that counts and hashes its content while it is written."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -129,10 +134,10 @@ class _HashingFile:
 
 
 class FolderWriter:
-    """Writes documents into a folder, then all scans that they speak of, then the manifest."""
+    """Writes documents into a folder, then their scans, then the manifest."""
 
     def __init__(self, directory: Path) -> None:
-        """:param directory: made where it is missing."""
+        """:param directory: folder, made where it is missing."""
         directory.mkdir(exist_ok=True)
         self._directory = directory
         self._scans = ScanWriter()
@@ -140,15 +145,15 @@ class FolderWriter:
 
     @property
     def files(self) -> tuple[FileRecord, ...]:
-        """What was written."""
+        """The files that were written or added."""
         return tuple(self._files.values())
 
     def add_files(self, files: Iterable[FileRecord]) -> None:
-        """Take in what another process wrote into the folder; the scans of that are among one's own."""
+        """Add files that another process wrote into the folder. Their scans must be in documents of this writer."""
         self._files |= {file.name: file for file in files}
 
     def write(self, name: str, document: object) -> None:
-        """Write a document, the same byte for byte for the same content."""
+        """Write a document; equal documents give equal bytes."""
         with (self._directory / f"{name}.bin").open("wb") as file, _without_garbage_collection():
             hashed = _HashingFile(file)
             content = to_plain(document, {np.ndarray: ArrayWriter(hashed).store, Scan: self._scans.store})
@@ -156,7 +161,7 @@ class FolderWriter:
         self.write_text(f"{name}.json", json.dumps(content, allow_nan=False, separators=(",", ":")) + "\n")
 
     def write_text(self, name: str, text: str) -> None:
-        """Write a file of text."""
+        """Write a text file."""
         with (self._directory / name).open("wb") as file:
             hashed = _HashingFile(file)
             hashed.write(text.encode())
@@ -165,8 +170,8 @@ class FolderWriter:
     def finish(self, kind: str, version: int) -> None:
         """Write the scans and the manifest.
 
-        :param kind: what the folder holds; a reader refuses any other.
-        :param version: of the form of its documents, likewise.
+        :param kind: format of the folder.
+        :param version: version of its documents.
         """
         self.write(SCANS, self._scans.table)
         files = {name: {"bytes": file.size, "sha256": file.sha256} for name, file in sorted(self._files.items())}
@@ -177,17 +182,17 @@ class FolderWriter:
 
 
 class FolderReader:
-    """Reads documents from a folder of which everything is as it was written.
+    """Reads documents from a folder and verifies it.
 
-    :ivar names: of the files.
+    :ivar names: names of the files.
     """
 
     def __init__(self, directory: Path, kind: str, version: int) -> None:
-        """Check the whole folder.
+        """Verify the whole folder.
 
-        :param kind: what it has to hold.
-        :param version: of the form of its documents.
-        :raises HmtSlamError: where it holds something else, of another version, or a file is missing or damaged.
+        :param kind: expected format.
+        :param version: expected version of its documents.
+        :raises HmtSlamError: where format or version differ, or a file is missing or damaged.
         """
         self._directory = directory
         manifest = self._read_manifest(kind, version)
@@ -234,7 +239,9 @@ class FolderReader:
     def read(self, name: str, kind: type[Document]) -> Document:
         """A document.
 
-        :raises HmtSlamError: where it is not of this form.
+        :param name: name of the document.
+        :param kind: its class.
+        :raises HmtSlamError: where it has another form; names the field.
         """
         return self._read_document(name, kind, {Scan: self._scans.reader})
 
@@ -247,7 +254,7 @@ class FolderReader:
 
 @contextmanager
 def _without_garbage_collection() -> Iterator[None]:
-    """The garbage collector need not look again and again through much that is made at once and stays."""
+    """A context without garbage collection, which is wasted on many lasting objects made at once."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -258,6 +265,6 @@ def _without_garbage_collection() -> Iterator[None]:
 
 
 def _manifest_digest(manifest: Mapping[str, object]) -> str:
-    """SHA-256 of all that a manifest holds besides it."""
+    """SHA-256 of a manifest without its own digest."""
     content = {name: value for name, value in manifest.items() if name != "sha256"}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""The form of documents in words, from the annotations and docstrings of what they hold."""
+"""The description of documents, from the annotations and docstrings of their classes."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _ROLE = re.compile(r":\w+:`~?(?:[\w.]+\.)?(\w+)`")
 
 
 def document_reference(kinds: Mapping[str, type]) -> list[str]:
-    """Lines of Markdown: a section for every document, and one for every object that they hold.
+    """Lines of Markdown: a section for each document, and one for each class of objects in them.
 
-    :param kinds: {name of a document: what it holds}.
+    :param kinds: {name of a document: its class}.
     """
     objects = {inner for kind in kinds.values() for inner in _nested_records(kind)} - set(kinds.values())
-    written = Counter(kind.__name__ for kind in objects)
+    counts = Counter(kind.__name__ for kind in objects)
     names = {kind: kind.__name__ for kind in objects}
-    names |= {kind: f"{_module_name(kind)}.{name}" for kind, name in names.items() if written[name] > 1}
+    names |= {kind: f"{_module_name(kind)}.{name}" for kind, name in names.items() if counts[name] > 1}
     sections = [line for name, kind in kinds.items() for line in _section_lines(kind, f"Document `{name}`", names)]
     ordered = sorted(objects, key=names.__getitem__)
     return sections + [line for kind in ordered for line in _section_lines(kind, names[kind], names)]
@@ -38,20 +38,20 @@ def _module_name(kind: type) -> str:
 
 
 def _nested_records(kind: type) -> Iterator[type]:
-    """The objects that one of some kind holds, at any depth."""
-    waiting: list[Any] = [kind]
-    seen: set[Any] = set()
-    while waiting:
-        found = waiting.pop()
-        if found in seen or found is Scan or get_origin(found) is np.ndarray:
+    """The classes of all objects in a document, at any depth."""
+    pending: list[Any] = [kind]
+    visited: set[Any] = set()
+    while pending:
+        annotation = pending.pop()
+        if annotation in visited or annotation is Scan or get_origin(annotation) is np.ndarray:
             continue
-        seen.add(found)
-        if is_record(found):
-            yield found
-            hints = get_type_hints(found)
-            waiting += [hints[name] for name in field_names(found)]
+        visited.add(annotation)
+        if is_record(annotation):
+            yield annotation
+            hints = get_type_hints(annotation)
+            pending += [hints[name] for name in field_names(annotation)]
         else:
-            waiting += get_args(found)
+            pending += get_args(annotation)
 
 
 def _section_lines(kind: type, title: str, names: Mapping[type, str]) -> list[str]:
@@ -59,8 +59,8 @@ def _section_lines(kind: type, title: str, names: Mapping[type, str]) -> list[st
     meanings = {name: _plain_text(meaning) for name, meaning in _IVAR.findall(text)}
     hints = get_type_hints(kind)
     rows = [f"| `{name}` | {_type_text(hints[name], names)} | {meanings.get(name, '')} |" for name in field_names(kind)]
-    about = _plain_text(text.split(":ivar", 1)[0].split("\n\n", 1)[0])
-    return [f"### {title}", "", about, "", "| field | type | meaning |", "|---|---|---|", *rows, ""]
+    summary = _plain_text(text.split(":ivar", 1)[0].split("\n\n", 1)[0])
+    return [f"### {title}", "", summary, "", "| field | type | meaning |", "|---|---|---|", *rows, ""]
 
 
 def _plain_text(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Scans, each stored once however many documents speak of it."""
+"""Scans, each stored once for all documents."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from hmt_slam_ros.plain_data import Reader
 from hmt_slam_ros.sensors import Scan
 
 _GEOMETRY = ("angle_min", "angle_increment", "range_min", "range_max", "time_increment")
+"""Fields of a scan in the columns of ``ScanTable.geometry``."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScanTable:
-    """Scans, as :class:`~hmt_slam_ros.sensors.Scan` describes them.
+    """The fields of n scans (:class:`~hmt_slam_ros.sensors.Scan`).
 
-    :ivar names: shape (n,), by which the other documents refer to them: their stamps, or where two have the same stamp
-        the next number that is free.
+    :ivar names: shape (n,), names of the scans in other documents: their stamps, or for an equal stamp the next free
+        number.
     :ivar stamps: shape (n,), time of the first beam, ns.
-    :ivar beams: shape (n,), how many beams each has.
-    :ivar ranges: shape (sum of the beams,), m, scan by scan; NaN or out of the limits where nothing came back.
+    :ivar beams: shape (n,), number of beams.
+    :ivar ranges: shape (sum of the beams,), m, scan by scan; NaN or out of the limits for no return.
     :ivar geometry: shape (n, 5): angle of the first beam in the laser's frame and from one beam to the next, rad,
         smallest valid range and smallest range that means "no return", m, time from one beam to the next, s.
     :ivar laser_poses: shape (n, 3), ``base_T_laser``, m and rad.
     :ivar motions: shape (n, 3), the base's motion from the first beam to the last as a twist, m, m, rad.
-    :ivar partial_beams: shape (c,), beams of all scans, counted through as in ``ranges``, that do not hold from the
-        laser on.
-    :ivar partial_starts: shape (c,), from where on each of these holds, m.
+    :ivar partial_beams: shape (c,), indices into ``ranges`` of beams that are not valid from the laser on.
+    :ivar partial_starts: shape (c,), distance from the laser from which each of these is valid, m.
     """
 
     names: Int64
@@ -45,11 +45,11 @@ class ScanTable:
 
     @classmethod
     def from_scans(cls, names: Iterable[int], scans: Iterable[Scan]) -> ScanTable:
-        """Of some scans."""
+        """The table of scans with their names."""
         rows = list(scans)
         starts = [np.zeros_like(scan.ranges) if scan.starts is None else scan.starts for scan in rows]
-        begins = np.concatenate([np.zeros(0, np.float32), *starts], dtype=np.float32)
-        cut = np.flatnonzero(begins)
+        all_starts = np.concatenate([np.zeros(0, np.float32), *starts], dtype=np.float32)
+        partial = np.flatnonzero(all_starts)
         return cls(
             np.array(list(names), dtype=np.int64),
             np.array([scan.stamp for scan in rows], dtype=np.int64),
@@ -58,15 +58,15 @@ class ScanTable:
             np.array([[getattr(scan, name) for name in _GEOMETRY] for scan in rows]).reshape(-1, len(_GEOMETRY)),
             np.array([scan.laser_pose for scan in rows], dtype=np.float64).reshape(-1, 3),
             np.array([scan.motion for scan in rows], dtype=np.float64).reshape(-1, 3),
-            cut,
-            begins[cut],
+            partial,
+            all_starts[partial],
         )
 
     def to_scans(self) -> dict[int, Scan]:
         """{name: scan}."""
         ends = np.cumsum(self.beams)
-        begins = np.zeros(self.ranges.size, dtype=np.float32)
-        begins[self.partial_beams] = self.partial_starts
+        starts = np.zeros(self.ranges.size, dtype=np.float32)
+        starts[self.partial_beams] = self.partial_starts
         rows = zip(
             self.names.tolist(),
             self.stamps.tolist(),
@@ -83,7 +83,7 @@ class ScanTable:
                 ranges=self.ranges[begin:end],
                 laser_pose=laser_pose,
                 motion=motion,
-                starts=begins[begin:end] if begins[begin:end].any() else None,
+                starts=starts[begin:end] if starts[begin:end].any() else None,
                 **dict(zip(_GEOMETRY, geometry, strict=True)),
             )
             for name, stamp, begin, end, geometry, laser_pose, motion in rows
@@ -91,20 +91,20 @@ class ScanTable:
 
 
 class ScanWriter:
-    """Takes the scans of documents that are written; there they have names."""
+    """Collects the scans of documents, in which they have names."""
 
     def __init__(self) -> None:
-        """Without any."""
+        """A writer without scans."""
         self._names: dict[int, int] = {}
         self._scans: dict[int, Scan] = {}
 
     @property
     def table(self) -> ScanTable:
-        """All that were named."""
+        """The table of all scans."""
         return ScanTable.from_scans(self._scans.keys(), self._scans.values())
 
     def store(self, value: Scan) -> object:
-        """The name of a scan, the same for one and the same object."""
+        """The name of a scan, which depends on the identity of the object."""
         name = self._names.get(id(value), value.stamp)
         while id(value) not in self._names:
             if name not in self._scans:
@@ -115,14 +115,14 @@ class ScanWriter:
 
 
 class ScanReader:
-    """Finds the scans of documents that are read, one and the same object for a name."""
+    """Reads the scans of documents: the same object for the same name."""
 
     def __init__(self, table: ScanTable) -> None:
-        """:param table: of all scans."""
+        """:param table: table of all scans."""
         self._scans = table.to_scans()
 
-    def reader(self, field: str, kind: Hashable) -> Reader:  # noqa: ARG002  all are of one kind
-        """What finds a scan by its name."""
+    def reader(self, field: str, kind: Hashable) -> Reader:  # noqa: ARG002  all scans have one type
+        """The reader of scans by their names."""
 
         def read(content: object, path: str) -> Scan:
             if not isinstance(content, int) or content not in self._scans:

@@ -1,4 +1,4 @@
-"""What the page shows, between the thread that listens to the nodes and those that serve browsers."""
+"""The content of the live page, shared by the thread that receives messages and those that serve browsers."""
 
 from __future__ import annotations
 
@@ -14,71 +14,69 @@ from typing import Any
 from hmt_slam_ros.messages.documents import KeyframeHeader
 from hmt_slam_ros.messages.messages import Hypotheses
 
-_SECOND = 1e9
-# Of an event; what is left out has the smallest probabilities, and is shown with what was not examined.
-_MOST_BARS = 12
+_MAX_BARS = 12
+"""Hypotheses of an event that the page shows. It adds the others, the least probable, to the unexamined probability."""
+
+HISTORY_LENGTH = 1000
+"""Keyframe events that the page shows: about ten minutes of a moving robot."""
+
+_RECONNECT_TIME = 10.0
+"""Time within which a browser may reconnect by itself, s."""
 
 
 class KeyframeHistory:
-    """Joins keyframes, which know the time, with the answers to them; the two come on topics of their own."""
+    """Joins keyframes, which have the time, with the hypotheses that answer them: the two have separate topics."""
 
     def __init__(self, board: Board) -> None:
         self._board = board
-        self._heads: dict[int, KeyframeHeader] = {}
+        self._headers: dict[int, KeyframeHeader] = {}
         self._answers: dict[int, Hypotheses] = {}
         self._published_stamps: dict[int, int] = {}
 
     def add(self, message: KeyframeHeader | Hypotheses) -> None:
-        """Take in one of the two."""
-        kept: dict[int, Any] = self._heads if isinstance(message, KeyframeHeader) else self._answers
-        kept[message.sequence] = message
-        while len(kept) > HISTORY_LENGTH:
-            del kept[min(kept)]
+        """Store a message until its counterpart arrives."""
+        pending: dict[int, Any] = self._headers if isinstance(message, KeyframeHeader) else self._answers
+        pending[message.sequence] = message
+        while len(pending) > HISTORY_LENGTH:
+            del pending[min(pending)]
 
     def publish_complete(self) -> None:
-        """Put what is complete on the board.
+        """Append the events whose two messages are there to the history of the board.
 
-        What a node that was started again repeats is passed over; an event that was there before, but at another time,
-        begins a new run.
+        Events that a restarted node repeats are skipped. A known event with another stamp begins a new run.
         """
-        for sequence in sorted(self._heads.keys() & self._answers.keys()):
-            head, answer = self._heads.pop(sequence), self._answers.pop(sequence)
-            if self._published_stamps.get(sequence) == head.scan.stamp:
+        for sequence in sorted(self._headers.keys() & self._answers.keys()):
+            header, answer = self._headers.pop(sequence), self._answers.pop(sequence)
+            if self._published_stamps.get(sequence) == header.scan.stamp:
                 continue
             if self._published_stamps and sequence <= max(self._published_stamps):
                 self._published_stamps = {}
                 self._board.clear_history()
-            self._published_stamps[sequence] = head.scan.stamp
+            self._published_stamps[sequence] = header.scan.stamp
             while len(self._published_stamps) > HISTORY_LENGTH:
                 del self._published_stamps[min(self._published_stamps)]
-            self._board.append_event(_event_entry(head, answer))
+            self._board.append_event(_event_entry(header, answer))
 
 
-def _event_entry(head: KeyframeHeader, answer: Hypotheses) -> dict[str, Any]:
-    """Time (s), way (m), and (hypothesis, area, probability, whether it is lost), the most probable first."""
-    leaves = sorted(answer.hypotheses, key=lambda leaf: (-leaf.probability, leaf.id))[:_MOST_BARS]
+def _event_entry(header: KeyframeHeader, answer: Hypotheses) -> dict[str, Any]:
+    """Time, s, path length, m, and (hypothesis, area, probability, lost) of each, the most probable first."""
+    hypotheses = sorted(answer.hypotheses, key=lambda hypothesis: (-hypothesis.probability, hypothesis.id))[:_MAX_BARS]
     return {
-        "event": head.sequence,
-        "time": round(head.scan.stamp / _SECOND, 3),
-        "path_length": round(head.path_length, 2),
-        "hypotheses": [[leaf.id, leaf.area, round(leaf.probability, 5), leaf.lost] for leaf in leaves],
+        "event": header.sequence,
+        "time": round(header.scan.stamp / 1e9, 3),
+        "path_length": round(header.path_length, 2),
+        "hypotheses": [[h.id, h.area, round(h.probability, 5), h.lost] for h in hypotheses],
         "live": len(answer.hypotheses),
     }
 
 
-# Some ten minutes of a robot that drives; older probabilities leave the picture.
-HISTORY_LENGTH = 1000
-# A browser that was here so many seconds ago may come back: it reconnects by itself.
-_RECONNECT_TIME = 10.0
-
-
 @dataclass
 class ClientState:
-    """What one browser knows.
+    """What was sent to one browser.
 
-    :ivar section_versions: {section: its number when it was sent}.
+    :ivar section_versions: {section: its version when it was sent}.
     :ivar next_event: number of the next event to send.
-    :ivar generation: of the history that these belong to.
+    :ivar generation: generation of the history to which that event belongs.
     """
 
     section_versions: dict[str, int] = field(default_factory=dict)
@@ -87,10 +85,7 @@ class ClientState:
 
 
 class Board:
-    """Sections that are replaced, a history that grows, and the picture of the map.
-
-    All methods may be called from any thread.
-    """
+    """Sections that are replaced, a history of events that grows, and the picture of the map. Thread-safe."""
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
@@ -102,7 +97,7 @@ class Board:
         self._map_image, self._map_tag = b"", ""
 
     def put(self, section: str, content: Any) -> None:  # noqa: ANN401  any JSON value
-        """Replace a section, where it is not the same."""
+        """Replace a section, unless it is equal."""
         with self._condition:
             known = self._sections.get(section)
             if known is None or known[1] != content:
@@ -111,47 +106,47 @@ class Board:
                 self._condition.notify_all()
 
     def append_event(self, event: Any) -> None:  # noqa: ANN401  any JSON value
-        """Add to the history."""
+        """Append an event to the history."""
         with self._condition:
             self._history.append(event)
             self._event_count += 1
             self._condition.notify_all()
 
     def clear_history(self) -> None:
-        """Begin the history anew."""
+        """Clear the history and begin a new generation."""
         with self._condition:
             self._history.clear()
             self._generation += 1
             self._condition.notify_all()
 
     def put_map_image(self, picture: bytes) -> str:
-        """Replace the map's picture; return the tag by which a browser knows whether it has it."""
+        """Replace the picture of the map, a PNG, and return its HTTP entity tag."""
         with self._condition:
             self._map_image, self._map_tag = picture, hashlib.sha256(picture).hexdigest()[:16]
             return self._map_tag
 
     def map_image(self) -> tuple[bytes, str]:
-        """The map's picture, empty where there is none, and its tag."""
+        """The picture of the map, empty where there is none, and its tag."""
         with self._condition:
             return self._map_image, self._map_tag
 
     def wait_for_changes(self, client: ClientState, timeout: float = 0.0) -> dict[str, Any]:
-        """What a browser does not know yet; it is noted that it does now.
+        """The sections and events that a browser does not have, {} where there are none; updates the client's state.
 
-        :param timeout: how long news is waited for, s.
+        :param timeout: longest wait for a change, s.
         """
         with self._condition:
             self._condition.wait_for(lambda: self._has_changes(client), timeout)
-            news = {
+            changes = {
                 name: content for name, (n, content) in self._sections.items() if n != client.section_versions.get(name)
             }
             client.section_versions = {name: number for name, (number, _) in self._sections.items()}
             if self._has_changes(client):
                 anew = client.generation != self._generation
                 missed = len(self._history) if anew else min(self._event_count - client.next_event, len(self._history))
-                news["history"] = {"anew": anew, "events": list(self._history)[len(self._history) - missed :]}
+                changes["history"] = {"anew": anew, "events": list(self._history)[len(self._history) - missed :]}
                 client.generation, client.next_event = self._generation, self._event_count
-            return news
+            return changes
 
     def _has_changes(self, client: ClientState) -> bool:
         return (
@@ -162,7 +157,7 @@ class Board:
 
     @contextmanager
     def count_watcher(self) -> Iterator[None]:
-        """Within this, somebody looks."""
+        """A context in which a browser is connected."""
         with self._condition:
             self._watchers += 1
         try:
@@ -174,6 +169,6 @@ class Board:
 
     @property
     def is_watched(self) -> bool:
-        """Whether somebody looks, or did a moment ago."""
+        """Whether a browser is connected, or was within the time in which it may reconnect."""
         with self._condition:
             return self._watchers > 0 or time.monotonic() - self._last_watched < _RECONNECT_TIME

@@ -1,4 +1,4 @@
-"""Whether all is well: what the nodes say of themselves, and what they do not say any more."""
+"""The health of the system: the diagnostics of the nodes, and which nodes and poses are missing."""
 
 from __future__ import annotations
 
@@ -8,27 +8,35 @@ from typing import Any, Literal
 
 Level = Literal["good", "waiting", "attention", "fault"]
 
-# Nodes speak once a second; a kernel that is compiled, or a computer that has too much to do, takes longer.
-_NODE_TIMEOUT = 10.0  # s
-_POSE_TIMEOUT = 3.0  # s
-# A node's level never falls again: a warning is news for so long.
-_WARNING_LIFETIME = 60.0  # s
+_NODE_TIMEOUT = 10.0
+"""Time without diagnostics after which a node is silent, s. They come once a second; compiling a kernel delays them."""
+
+_POSE_TIMEOUT = 3.0
+"""Time without a pose that is a fault, s."""
+
+_WARNING_LIFETIME = 60.0
+"""Time for which the page shows a warning, s: the level of a node never falls."""
+
 _WARN = 1
+"""Level of a warning in diagnostic_msgs/DiagnosticStatus."""
+
 _ACTIVE = "active"
-# From a state of a managed node towards the one in which it takes part.
+"""Lifecycle state of a node that processes messages."""
+
 _NEXT_TRANSITION = {"unconfigured": "configure", "inactive": "activate"}
+"""{lifecycle state: transition towards the active state}."""
 
 
 @dataclass
 class NodeHealth:
-    """What a node said of itself last.
+    """The last diagnostics of a node.
 
     :ivar level: 0 all is well, 1 a warning, 2 an error, as in diagnostic_msgs/DiagnosticStatus.
     :ivar message: "running", or the last warning or error.
     :ivar values: {name: value}.
-    :ivar heard_at: when that was, seconds.
-    :ivar changed_at: when the message was heard first, seconds.
-    :ivar load: share of the time that it computed between the last two times, None before the second.
+    :ivar heard_at: time of arrival, s.
+    :ivar changed_at: time at which the message arrived first, s.
+    :ivar load: share of the time that the node computed between the last two diagnostics, None before the second.
     """
 
     level: int
@@ -41,13 +49,13 @@ class NodeHealth:
 
 @dataclass
 class SystemHealth:
-    """Of all nodes.
+    """The health of all nodes.
 
-    :ivar expected_nodes: the nodes without which there is no mapping.
-    :ivar nodes: {node: what it said last}.
-    :ivar last_pose_at: when the last pose came, None before the first, seconds.
-    :ivar is_localized: whether the robot's place is known, None before somebody said.
-    :ivar robot_state: of the node that replays a log, None where there is none.
+    :ivar expected_nodes: nodes without which there is no mapping.
+    :ivar nodes: {node: its last diagnostics}.
+    :ivar last_pose_at: time of the last pose, s, None before the first.
+    :ivar is_localized: whether the robot is localized, None before the first status.
+    :ivar robot_state: state of the node that replays a log, None where there is none.
     """
 
     expected_nodes: Sequence[str]
@@ -57,15 +65,15 @@ class SystemHealth:
     robot_state: str | None = None
 
     def update(self, node: str, level: int, message: str, values: Mapping[str, str], now: float) -> None:
-        """Take note of what a node says of itself.
+        """Store the diagnostics of a node.
 
-        :param now: seconds of a clock that runs evenly.
+        :param now: time on a monotonic clock, s.
         """
-        before, load, changed = self.nodes.get(node), None, now
-        if before is not None and now > before.heard_at:
-            load = max(0.0, _busy_seconds(values) - _busy_seconds(before.values)) / (now - before.heard_at)
-        if before is not None and before.message == message:
-            changed = before.changed_at
+        previous, load, changed = self.nodes.get(node), None, now
+        if previous is not None and now > previous.heard_at:
+            load = max(0.0, _busy_seconds(values) - _busy_seconds(previous.values)) / (now - previous.heard_at)
+        if previous is not None and previous.message == message:
+            changed = previous.changed_at
         self.nodes[node] = NodeHealth(level, message, values, now, changed, load)
 
     def rows(self, now: float) -> list[dict[str, Any]]:
@@ -85,19 +93,18 @@ class SystemHealth:
         return row if node.load is None else {**row, "load": round(min(node.load, 1.0), 2)}
 
     def verdict(self, now: float) -> dict[str, str]:
-        """All of it in one sentence, the worst first, and what to do."""
-        said, pose = self._complaint_verdicts(now), self._pose_verdict(now)
-        halted = self._inactive_nodes_verdict()
-        for sentence in (
+        """The most serious condition: its level, a sentence and advice."""
+        diagnostics = self._diagnostics_verdicts(now)
+        for verdict in (
             self._no_nodes_verdict(),
             self._silent_nodes_verdict(now),
-            said.get("fault"),
-            halted,
-            pose,
-            said.get("attention"),
+            diagnostics.get("fault"),
+            self._inactive_nodes_verdict(),
+            self._pose_verdict(now),
+            diagnostics.get("attention"),
         ):
-            if sentence is not None:
-                return sentence
+            if verdict is not None:
+                return verdict
         if self.is_localized is False:
             return _verdict("attention", "The robot's place is not known yet: it may be anywhere in the map.")
         if self.robot_state == "ended":
@@ -136,8 +143,8 @@ class SystemHealth:
                 return _verdict("waiting", f"{name} is {state}.", advice)
         return None
 
-    def _complaint_verdicts(self, now: float) -> dict[Level, dict[str, str]]:
-        """{level: what a node complains of}."""
+    def _diagnostics_verdicts(self, now: float) -> dict[Level, dict[str, str]]:
+        """{level: verdict on the first node of that level}."""
         levels = {name: _level(node, now) for name, node in self.nodes.items()}
         verbs: dict[Level, str] = {"fault": "has a fault", "attention": "warns"}
         return {
@@ -170,7 +177,7 @@ def _level(node: NodeHealth, now: float) -> Level:
 
 
 def _state(node: NodeHealth) -> str:
-    """Of a managed node; others are active."""
+    """Lifecycle state; nodes without one are active."""
     return node.values.get("state", _ACTIVE)
 
 
@@ -179,7 +186,7 @@ def _join_names(names: Sequence[str]) -> str:
 
 
 def _busy_seconds(values: Mapping[str, str]) -> float:
-    """Seconds of computing since the start, as /diagnostics has them."""
+    """Computing time since the start, s."""
     try:
         return float(values.get("busy", "0").removesuffix(" s"))
     except ValueError:

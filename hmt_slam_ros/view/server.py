@@ -1,13 +1,12 @@
-"""The page's server: three files, the map's picture, and a stream of news; nothing can be changed through it."""
+"""The server of the live page: its files, the picture of the map and a stream of changes; it is read-only."""
 
 from __future__ import annotations
 
+import io
 import ipaddress
 import json
-import struct
 import threading
 import time
-import zlib
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -15,54 +14,56 @@ from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.view.board import Board, ClientState
 
-_UNKNOWN, _FREE, _OCCUPIED = 0, 1, 3
-# Grayscale of two bits, without interlacing: see section 11.2.2 of the PNG specification, ISO/IEC 15948.
-_BITS, _GRAY = 2, 0
-_CELLS_IN_BYTE = 4
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_OCCUPIED_FROM = 50  # of 100
+_UNKNOWN, _FREE, _OCCUPIED = 0, 85, 255
+"""Gray levels of the map's picture, which the page replaces by its colors."""
 
-
-def grid_png(cells: NDArray[np.int8]) -> bytes:
-    """Black where nothing is known, dark gray where free, white where occupied; the browser gives it its colors.
-
-    :param cells: shape (height, width), -1 unknown, else 0 to 100; row 0 is the smallest y, and the picture's lowest.
-    """
-    height, width = cells.shape
-    levels = np.full((height, -(-width // _CELLS_IN_BYTE) * _CELLS_IN_BYTE), _UNKNOWN, dtype=np.uint8)
-    levels[:, :width][cells >= 0] = _FREE
-    levels[:, :width][cells >= _OCCUPIED_FROM] = _OCCUPIED
-    quads = levels[::-1].reshape(height, -1, _CELLS_IN_BYTE)
-    packed = (quads << np.array([6, 4, 2, 0], dtype=np.uint8)).sum(axis=2, dtype=np.uint8)
-    # Every row begins with the number of its filter, 0 for none.
-    rows = np.concatenate([np.zeros((height, 1), dtype=np.uint8), packed], axis=1)
-    header = struct.pack(">IIBBBBB", width, height, _BITS, _GRAY, 0, 0, 0)
-    body = zlib.compress(rows.tobytes(), level=6)
-    return _SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", body) + _chunk(b"IEND", b"")
-
-
-def _chunk(kind: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
+_OCCUPIED_FROM = 50
+"""Least occupancy of an occupied cell, of 100, as in nav_msgs/OccupancyGrid viewers."""
 
 LOCAL, PORT = "127.0.0.1", 8800
+"""Default address and port of the page."""
+
 PAGE = Path(__file__).parent / "page"
+"""Folder of the page's files."""
+
 _FILES = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/view.css": ("view.css", "text/css; charset=utf-8"),
     "/view.js": ("view.js", "text/javascript; charset=utf-8"),
     "/draw.js": ("draw.js", "text/javascript; charset=utf-8"),
 }
+"""{path of a request: (file, content type)}."""
+
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
-_PERIOD = 0.2  # s between two pieces of news
-# A browser that is gone is noticed when something is written to it.
-_HEARTBEAT = 5.0  # s
-_MOST_STREAMS = 20
+"""Host names under which a page that listens on the loopback interface is served."""
+
+_PERIOD = 0.2
+"""Least time between two events of a stream, s."""
+
+_HEARTBEAT = 5.0
+"""Longest time without a line on a stream, s: a closed connection shows only when something is written to it."""
+
+_MAX_STREAMS = 20
+"""Streams that are served at once."""
+
 _SECURITY = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'"
+"""Content security policy: the page loads nothing from elsewhere."""
+
+
+def grid_png(cells: NDArray[np.int8]) -> bytes:
+    """An occupancy grid as a PNG of three gray levels: black unknown, dark gray free, white occupied.
+
+    :param cells: shape (height, width), -1 unknown, else 0 to 100; row 0 is the smallest y, and the picture's lowest.
+    """
+    levels = np.select([cells >= _OCCUPIED_FROM, cells >= 0], [_OCCUPIED, _FREE], _UNKNOWN).astype(np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(levels[::-1]).save(file, "PNG")
+    return file.getvalue()
 
 
 class PageServer:
@@ -72,18 +73,18 @@ class PageServer:
     """
 
     def __init__(self, board: Board, address: str, port: int) -> None:
-        """Listen.
+        """Start to listen.
 
         :param address: IP address of the interface to listen on.
-        :param port: 0 for any that is free.
-        :raises HmtSlamError: where that cannot be.
+        :param port: TCP port, 0 for any free one.
+        :raises HmtSlamError: where the address is invalid or the port is taken.
         """
         try:
             local = ipaddress.ip_address(address).is_loopback
         except ValueError:
             raise HmtSlamError(f"address = {address} is no IP address: give 127.0.0.1, or 0.0.0.0 for all") from None
-        own = {"board": board, "local": local, "streams": threading.Semaphore(_MOST_STREAMS)}
-        handler = type("_OwnHandler", (_Handler,), own)
+        attributes = {"board": board, "local": local, "streams": threading.Semaphore(_MAX_STREAMS)}
+        handler = type("_BoardHandler", (_Handler,), attributes)
         self._server = _bind_server(address, port, handler)
         self.url = f"http://{address}:{self._server.server_address[1]}/"
         threading.Thread(target=self._server.serve_forever, name="page", daemon=True).start()
@@ -95,9 +96,9 @@ class PageServer:
 
 
 def check_port(port: int) -> None:
-    """See whether a page could be served on a port of this computer.
+    """Check that a page can be served on a port of this computer.
 
-    :raises HmtSlamError: where it cannot.
+    :raises HmtSlamError: where the port is taken.
     """
     _bind_server(LOCAL, port, _Handler).server_close()
 
@@ -114,12 +115,12 @@ def _bind_server(address: str, port: int, handler: type[BaseHTTPRequestHandler])
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
-    # Several pages may come at once, as after a restart.
+    # After a restart, several pages connect at once.
     request_queue_size = 64
     block_on_close = False
 
     def handle_error(self, _request: object, _client_address: object) -> None:
-        """A browser that went away amid an answer is no fault."""
+        """Ignore a browser that closed its connection during an answer."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -132,7 +133,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer a browser."""
         path = urlsplit(self.path).path
         if self.local and urlsplit(f"//{self.headers.get('Host', '')}").hostname not in _LOOPBACK:
-            # A page of another site whose name was made to lead here.
+            # DNS rebinding: a page of another site whose name resolves to this computer.
             self._answer(HTTPStatus.FORBIDDEN, "text/plain", b"ask for 127.0.0.1 or localhost")
         elif path in _FILES:
             name, kind = _FILES[path]
@@ -157,7 +158,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.OK, "image/png", picture, tag)
 
     def _stream(self) -> None:
-        """Server-sent events: a JSON object of the sections that changed, at most five times a second."""
+        """Send server-sent events: JSON objects of the sections that changed, at most five a second."""
         if not self.streams.acquire(blocking=False):
             self._answer(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", b"too many pages look on: close some")
             return
@@ -165,11 +166,11 @@ class _Handler(BaseHTTPRequestHandler):
             self._send_header(HTTPStatus.OK, "text/event-stream")
             self.send_header("Connection", "close")
             self.end_headers()
-            seen = ClientState()
+            client = ClientState()
             with self.board.count_watcher():
                 while True:
-                    news = self.board.wait_for_changes(seen, _HEARTBEAT)
-                    text = f"data: {json.dumps(news, allow_nan=False, separators=(',', ':'))}" if news else ":"
+                    changes = self.board.wait_for_changes(client, _HEARTBEAT)
+                    text = f"data: {json.dumps(changes, allow_nan=False, separators=(',', ':'))}" if changes else ":"
                     self.wfile.write(f"{text}\n\n".encode())
                     self.wfile.flush()
                     time.sleep(_PERIOD)
@@ -195,4 +196,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("X-Content-Type-Options", "nosniff")
 
     def log_message(self, *_: object) -> None:
-        """Requests are no news."""
+        """Log no requests."""

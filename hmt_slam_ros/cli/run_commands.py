@@ -1,4 +1,4 @@
-"""``hmt_slam map``: a log becomes an output folder, all in one process."""
+"""The commands that map a log into an output folder: ``map`` in one process, ``replay`` by the ROS nodes."""
 
 from __future__ import annotations
 
@@ -25,13 +25,19 @@ from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.final_map import FinalMap, deskewed_scans, final_map
 from hmt_slam_ros.results.hmt_map import RunState, read_run_state, read_saved_map
 from hmt_slam_ros.results.log_reading import describe_log, describe_parameter_changes, is_newest_log, map_folder
-from hmt_slam_ros.results.output_folder import atomic_output, map_writer, write_output
-from hmt_slam_ros.results.report import RunMetrics, code_bytes
+from hmt_slam_ros.results.output_folder import (
+    RunMetrics,
+    atomic_output,
+    check_replaceable,
+    code_bytes,
+    map_writer,
+    write_output,
+)
 from hmt_slam_ros.saved_map.folder import HMT_MAP
 
 
-def run(options: argparse.Namespace) -> None:
-    """Map the log and say what came of it."""
+def run_map(options: argparse.Namespace) -> None:
+    """Map the log, write the output folder and print a summary."""
     configuration, state, log = _initial_state(options)
     log_seconds = log.duration
     with atomic_output(options.out) as folder:
@@ -46,7 +52,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _initial_state(options: argparse.Namespace) -> tuple[Configuration, RunState, Log]:
-    """What the run begins with, which is nothing or the map that it goes on from, and the log."""
+    """Configuration, initial state and log of a run, which continues the map of ``--from`` where that is given."""
     if options.source is None:
         configuration = chosen_configuration(options)
         if configuration.mode == "localization":
@@ -63,13 +69,13 @@ def _initial_state(options: argparse.Namespace) -> tuple[Configuration, RunState
         configuration = chosen_configuration(options, with_changes(whole, {"robot.start": 0.0}))
         log = _open_time_window(options.log, configuration)
     changes = describe_parameter_changes(saved, configuration, further=further)
-    for told in filter(None, (describe_log(state.log, log.name, further=further), changes)):
-        print(f"hmt_slam map: {told}", file=sys.stderr)
+    for sentence in filter(None, (describe_log(state.log, log.name, further=further), changes)):
+        print(f"hmt_slam map: {sentence}", file=sys.stderr)
     return configuration, state, log
 
 
 def _open_time_window(path: Path, configuration: Configuration) -> Log:
-    """The part of the log that was asked for."""
+    """The part of a log that ``robot.start`` and ``robot.duration`` select."""
     log = open_log(path, start=configuration.robot.start, duration=configuration.robot.duration or None)
     if not log.scan_count:
         raise HmtSlamError(f"{path} has no scans in the part asked for: check --start and --duration")
@@ -82,14 +88,14 @@ def run_measured(
     state: RunState | None = None,
     on_state: Callable[[RunState], None] | None = None,
 ) -> tuple[FinalMap, NDArray[np.int64], RunMetrics]:
-    """Map a log, and measure what that costs.
+    """Map a log and measure the cost.
 
-    :param state: to go on from.
-    :param on_state: called with the state at the end of the log, before that is told.
-    :returns: the map, the log's own stamps of all scans (n,), ns, and the figures.
+    :param state: state from which the run continues.
+    :param on_state: called with the state at the end of the log, before the processes receive ``EndOfLog``.
+    :returns: the map, the log's own stamps of all scans, shape (n,), ns, and the figures.
     """
     wall, cpu = time.monotonic(), time.process_time()
-    # Libraries and the log stay to the end: the garbage collector need not look through them again and again.
+    # Libraries and the log stay in memory to the end, so the garbage collector need not scan them.
     gc.freeze()
     with Progress(log.scan_count, log.duration) as progress:
         result = run_log(log, configuration, progress, state=state, on_state=on_state, compact_record=True)
@@ -110,3 +116,22 @@ def run_measured(
         memory={"particle_maps": result.map_bytes} | code_bytes(),
     )
     return final, result.log_progress.source_stamps, figures
+
+
+def run_replay(options: argparse.Namespace) -> None:
+    """Start the nodes, wait for the end of the log and print a summary."""
+    configuration = chosen_configuration(options)
+    check_replaceable(options.out.absolute())
+    log = open_log(options.log, start=configuration.robot.start, duration=configuration.robot.duration or None)
+    try:
+        from hmt_slam_ros.ros.replay import replay  # noqa: PLC0415  the only command that needs ROS
+    except ImportError as fault:
+        raise HmtSlamError(f"replay needs ROS ({fault}): source Jazzy or install its wheels, or use map") from fault
+    if options.view is not None:
+        from hmt_slam_ros.view.server import LOCAL, check_port  # noqa: PLC0415  Pillow is for the page alone
+
+        check_port(options.view)
+        print(f"the live page is at http://{LOCAL}:{options.view}/", file=sys.stderr)
+    with Progress(log.scan_count, log.duration) as progress:
+        replayed = replay(options.log, options.out, configuration, progress, view_port=options.view)
+    print(summary(options.out, replayed.recording, log.duration, replayed.wall_seconds))
