@@ -12,7 +12,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from nav_msgs.srv import LoadMap
 from rcl_interfaces.msg import ParameterDescriptor
@@ -22,15 +22,15 @@ from rclpy.task import Future
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.documents import ResetRequest, ResetResponse, SaveRequest, SaveResponse, decode, encode
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.process_table import participant_names
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.diagnostics import PERIOD, NodeDiagnostics
+from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.initial_state import InitialState
 from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
+from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.topics import DOCUMENTS
 from hmt_slam_ros.saved_map.folder import HMT_MAP, MANIFEST, replace_folder
 
@@ -49,7 +49,7 @@ _REMEDY = "the map of before stays; make room, or set save_to of slam to another
 _FILE_SCHEME = "file://"
 
 
-class MapServicesNode(Protocol):
+class MapServicesNode(ProcessNode):
     """The node ``slam``, as far as the services need it.
 
     :ivar save_to: folder into which maps are saved.
@@ -57,50 +57,24 @@ class MapServicesNode(Protocol):
     :ivar estimate: the last estimate of metric SLAM, None before the first.
     """
 
+    process: MetricSlam
     save_to: Path
     map_frame: str
     estimate: LocalEstimate | None
 
     @property
-    def configuration(self) -> Configuration:
-        """The parameters of the node."""
-
-    @property
-    def diagnostics(self) -> NodeDiagnostics:
-        """Counts, values and faults for /diagnostics."""
-
-    @property
-    def process(self) -> MetricSlam:
-        """Metric SLAM."""
-
-    @property
     def is_busy(self) -> bool:
         """Whether a map is being saved or exchanged."""
+        raise NotImplementedError
 
     @property
     def unchanged_map_folder(self) -> Path | None:
         """Folder of the loaded map where the run did not change it, else None."""
+        raise NotImplementedError
 
     def write_map(self, writer: MapWriter) -> None:
         """Write the current map."""
-
-    def reset(self, folder: str, reset_number: int = 0) -> None:
-        """Start again with the map in ``folder``, or with nothing where that is empty."""
-
-    def get_logger(self) -> Any:  # noqa: ANN401  rclpy's
-        """The logger of the node."""
-
-    def create_publisher(self, kind: type, topic: str, profile: Any) -> Any:  # noqa: ANN401  rclpy's
-        """Make a publisher."""
-
-    def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], profile: Any) -> Any:  # noqa: ANN401
-        """Make a subscription."""
-
-    def create_timer(self, period: float, callback: Callable[[], None], **options: Any) -> Any:  # noqa: ANN401
-        """Make a timer; ``period`` in s."""
-
-    def create_service(self, kind: type, name: str, callback: Callable[..., Any], **options: Any) -> Any:  # noqa: ANN401
-        """Make a service."""
+        raise NotImplementedError
 
 
 class RequestCoordinator(ABC):

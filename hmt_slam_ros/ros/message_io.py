@@ -111,6 +111,7 @@ _HELD = "kept until it is active"
 class Inbox:
     """Subscriptions of a node to messages of the processes.
 
+    :ivar order: order of the chain, with its complete events and its first gap.
     :ivar final_counts: the counts that slam sends at the end, None before.
     :ivar is_holding: whether messages are kept instead of delivered.
     """
@@ -139,7 +140,7 @@ class Inbox:
         self._early: list[tuple[int, Callable[[], None]]] = []
         self._message_types = message_types = tuple(message_types)
         self._node, self._deliver, self._diagnostics = node, deliver, diagnostics
-        self._order = ChainOrder(message_types, first_event)
+        self.order = ChainOrder(message_types, first_event)
         self._estimate_profile = estimate_profile
         self.is_holding = False
         self._held: deque[Message] = deque()
@@ -172,7 +173,7 @@ class Inbox:
         :param first_event: number of the first keyframe event.
         :param reset_number: number of the reset request.
         """
-        self._order, self._reset_number = ChainOrder(self._message_types, first_event), reset_number
+        self.order, self._reset_number = ChainOrder(self._message_types, first_event), reset_number
         self._held.clear()
         self._headers.clear()
         self._ranges.clear()
@@ -189,16 +190,6 @@ class Inbox:
             take_in()
         elif reset_number > self._reset_number:
             self._early.append((reset_number, take_in))
-
-    @property
-    def fault(self) -> str | None:
-        """Sentence about the first gap in the chain, None without."""
-        return self._order.fault
-
-    @property
-    def events(self) -> int | None:
-        """Number of complete keyframe events, None within one."""
-        return self._order.events
 
     def _subscribe_to(self, kind: type) -> None:
         if kind is Keyframe:
@@ -285,12 +276,12 @@ class Inbox:
         if not isinstance(message, CHAIN):
             self._deliver(message)
             return
-        for due in self._order.push(message):  # type: ignore[arg-type]
+        for due in self.order.push(message):  # type: ignore[arg-type]
             self._deliver(due)
-        self._diagnostics.values["waiting for their turn"] = self._order.waiting_count
-        self._diagnostics.values["repeated"] = self._order.repeated_count
-        if self._order.fault is not None:
-            self._diagnostics.fail(self._order.fault)
+        self._diagnostics.values["waiting for their turn"] = self.order.waiting_count
+        self._diagnostics.values["repeated"] = self.order.repeated_count
+        if self.order.fault is not None:
+            self._diagnostics.fail(self.order.fault)
 
 
 def subscribe_document(

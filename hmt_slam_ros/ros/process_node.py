@@ -57,6 +57,8 @@ class ProcessNode(ManagedNode):
     :cvar is_always_listening: whether the process also gets messages while the node is inactive.
     :ivar save_on_shutdown: whether the map is saved before the node ends.
     :ivar process: the process, from :meth:`configure_node` on.
+    :ivar reset_number: number of the last reset request that was answered, 0 before the first.
+    :ivar is_recovering: whether the node handles inputs from the journal of a killed node.
     """
 
     is_always_listening = False
@@ -116,7 +118,7 @@ class ProcessNode(ManagedNode):
         :raises HmtSlamError: for a map or journal that is damaged or does not match.
         """
         recovered = self.recovery.recovered_state
-        self._reset_number, self._checkpoint_count, self._is_recovering = 0, 0, recovered is not None
+        self.reset_number, self._checkpoint_count, self.is_recovering = 0, 0, recovered is not None
         if recovered is None:
             self.initial_state = InitialState(self, self.start_from, lost=self._start_lost)
         else:
@@ -125,14 +127,14 @@ class ProcessNode(ManagedNode):
         if recovered is None:
             self._start_journal()
         report_compilation(self.get_logger().info)
-        self.outbox = Outbox(self, self._output_types, self._reset_number)
+        self.outbox = Outbox(self, self._output_types, self.reset_number)
         self.inbox = Inbox(
             self,
             SUBSCRIPTIONS[self._name],
             self.deliver,
             self.diagnostics,
             first_event=self.initial_state.events,
-            reset_number=self._reset_number,
+            reset_number=self.reset_number,
             resume_stamps=self.resume_stamps,
         )
         self._participant = RequestParticipant(self, self._name) if self._name in participant_names() else None
@@ -205,7 +207,7 @@ class ProcessNode(ManagedNode):
         self.initial_state = InitialState(self, folder, lost=True, previous_scans=self.scans)
         self.process = self._create_process()
         self.inbox.reset(self.initial_state.events, reset_number)
-        self._reset_number = self.outbox.reset_number = reset_number
+        self.reset_number = self.outbox.reset_number = reset_number
         self._start_journal()
 
     def _start_journal(self) -> None:
@@ -219,7 +221,7 @@ class ProcessNode(ManagedNode):
     def _journal_header(self, **fields: Any) -> JournalHeader:  # noqa: ANN401  of the header
         return JournalHeader(
             folder=str(self.initial_state.folder or ""),
-            reset_number=self._reset_number,
+            reset_number=self.reset_number,
             received=dict(self.diagnostics.received),
             stamps=self.recovery.stamps,
             **fields,
@@ -227,7 +229,7 @@ class ProcessNode(ManagedNode):
 
     def _recovered_initial_state(self, recovered: RecoveredState) -> InitialState:
         header = recovered.header
-        self._reset_number = header.reset_number
+        self.reset_number = header.reset_number
         self.diagnostics.received.update(header.received)
         if header.has_checkpoint:
             return InitialState.from_checkpoint(self, recovered.checkpoint_folder, header)
@@ -237,16 +239,6 @@ class ProcessNode(ManagedNode):
     def resume_stamps(self) -> Mapping[str, int]:
         """{measurement type: stamp, ns} after which past measurements are wanted too; empty for new ones alone."""
         return {}
-
-    @property
-    def reset_number(self) -> int:
-        """Number of the last reset request that was answered, 0 before the first."""
-        return self._reset_number
-
-    @property
-    def is_recovering(self) -> bool:
-        """Whether the node handles inputs from the journal of a killed node."""
-        return self._is_recovering
 
     def _configure(self) -> None:
         """As any managed node; then recover the state of a killed node."""
@@ -265,7 +257,7 @@ class ProcessNode(ManagedNode):
             self.outbox.resend(message)
         for value in recovered.inputs:
             self.replay_input(value)
-        self._is_recovering = False
+        self.is_recovering = False
         self.recovery.resume_journal()
         self.get_logger().warning(
             f"{self._name} was killed and goes on where it was: at keyframe event {recovered.header.events} and "
@@ -303,7 +295,7 @@ class ProcessNode(ManagedNode):
 
     def deliver(self, message: Message) -> None:
         """Let the process handle a message, and publish its outputs."""
-        if isinstance(message, TrackingReset) and not self._is_recovering and self.recovery.is_repeated_reset(message):
+        if isinstance(message, TrackingReset) and not self.is_recovering and self.recovery.is_repeated_reset(message):
             return
         self.recovery.record_input(message)
         outputs: list[Message] = []
@@ -329,7 +321,7 @@ class ProcessNode(ManagedNode):
 
     def _write_due_checkpoint(self) -> None:
         """Write a checkpoint where one is due, between keyframe events of a quiescent node."""
-        events = self.inbox.events
+        events = self.inbox.order.events
         if not self.recovery.is_checkpoint_due or events is None or not self.is_quiescent:
             return
         header = self._journal_header(

@@ -224,6 +224,8 @@ class Recovery:
     complete; the newest such one counts.
 
     :ivar recovered_state: state of a node of the same name that was killed, None without.
+    :ivar stamps: {measurement type: stamp of the last one received, ns}.
+    :ivar tracking_reset: the last one received, None without.
     """
 
     def __init__(self, node: ManagedNode, folder: str) -> None:
@@ -239,8 +241,8 @@ class Recovery:
         self._journal: Journal | None = None
         self._recent_outputs: deque[Message] = deque(maxlen=_RESENT_MESSAGES)
         self._control_state: dict[tuple[type, str], ControlEvent] = {}
-        self._stamps: dict[str, int] = {}
-        self._tracking_reset: TrackingReset | None = None
+        self.stamps: dict[str, int] = {}
+        self.tracking_reset: TrackingReset | None = None
         self._checkpoint_seconds, self._busy_seconds = _FIRST_CHECKPOINT_SECONDS, 0.0
         self.recovered_state = None if self._folder is None else self._read_recovered_state(self._folder)
 
@@ -254,7 +256,7 @@ class Recovery:
         entries = [e for number in range(self._segment) for e in read_journal(newest, str(number), _JOURNAL_TYPES)]
         header = entries[0].value
         assert isinstance(header, JournalHeader)
-        self._stamps, self._tracking_reset = dict(header.stamps), header.tracking_reset
+        self.stamps, self.tracking_reset = dict(header.stamps), header.tracking_reset
         for entry in entries:
             self._track(entry)
         inputs = [e.value for e in entries if e.role == _INPUT]
@@ -270,23 +272,13 @@ class Recovery:
         elif entry.role == _OUTPUT:
             self._recent_outputs.append(value)  # type: ignore[arg-type]
         elif isinstance(value, TrackingReset):
-            self._tracking_reset = value
+            self.tracking_reset = value
         elif isinstance(value, Scan | Odometry):
-            self._stamps[type(value).__name__] = value.stamp
-
-    @property
-    def stamps(self) -> Mapping[str, int]:
-        """{measurement type: stamp of the last one received, ns}."""
-        return dict(self._stamps)
-
-    @property
-    def tracking_reset(self) -> TrackingReset | None:
-        """The last one received, if any."""
-        return self._tracking_reset
+            self.stamps[type(value).__name__] = value.stamp
 
     def is_repeated_reset(self, tracking_reset: TrackingReset) -> bool:
         """Whether this one was received before: a killed slam sends it again, and so does DDS to a killed node."""
-        last = self._tracking_reset
+        last = self.tracking_reset
         return last is not None and (tracking_reset.scans_before, tracking_reset.event) <= (
             last.scans_before,
             last.event,
@@ -317,7 +309,7 @@ class Recovery:
     def start_journal(self, header: JournalHeader) -> None:
         """Start a journal without a checkpoint, and forget earlier outputs."""
         self._recent_outputs.clear()
-        self._tracking_reset = None
+        self.tracking_reset = None
         try:
             self._start_generation(header, lambda _: None)
         except OSError as fault:

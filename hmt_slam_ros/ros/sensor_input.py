@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +15,12 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import LaserScan
 
 from hmt_slam_ros.logs.mounting import FrameTree, frame_name, planar_mounting
-from hmt_slam_ros.messages.messages import Message
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import scan_from_message, stamp_from_time
-from hmt_slam_ros.ros.diagnostics import PERIOD, NodeDiagnostics
+from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
 from hmt_slam_ros.ros.recovery import FrameMounting
-from hmt_slam_ros.ros.topics import SCAN, TFMessage
+from hmt_slam_ros.ros.topics import TFMessage
 from hmt_slam_ros.sensors import Odometry, Scan
-
-if TYPE_CHECKING:
-    from hmt_slam_ros.metric_slam.slam import MetricSlam
 
 MessageType = TypeVar("MessageType")
 
@@ -329,137 +324,3 @@ class LaserMountings:
             f"scans wait, the first of stamp {stamp_from_time(scan.header.stamp)} ns: publish it, or set the parameter "
             "laser_pose"
         )
-
-
-_LIVE_QUEUE = 200
-"""Scans in the queue of a live laser above which new ones are dropped; a replay never drops any."""
-
-
-class ScanReceiver(Protocol):
-    """The node ``slam``, as far as :class:`ScanIntake` needs it."""
-
-    @property
-    def diagnostics(self) -> NodeDiagnostics:
-        """Counts, values and faults for /diagnostics."""
-
-    @property
-    def process(self) -> MetricSlam:
-        """Metric SLAM."""
-
-    def deliver(self, message: Message) -> None:
-        """Let the process handle a message and publish its outputs."""
-
-    def deliver_ready_scans(self) -> None:
-        """Deliver the scans whose mounting is known."""
-
-
-class ScanIntake:
-    """Scans on their way to metric SLAM: they wait for the laser's transform, are skipped in a pause, or dropped.
-
-    :ivar monitor: checks of stamps and rates.
-    :ivar dropped_count: number of scans that the process does not get.
-    :ivar is_paused: whether scans are skipped.
-    :ivar last_scan_at: time of the last scan by the monotonic clock, s.
-    """
-
-    def __init__(self, node: ScanReceiver, mountings: LaserMountings, resume_stamp: int | None) -> None:
-        """Prepare; :meth:`start` subscribes.
-
-        :param resume_stamp: stamp of the last scan before, ns, as in :class:`SensorSubscription`.
-        """
-        self._node, self._mountings = node, mountings
-        self.monitor = SensorMonitor(node.diagnostics)
-        self.dropped_count, self.is_paused = 0, False
-        self.last_scan_at = self._waiting_since = time.monotonic()
-        self._waiting: deque[LaserScan] = deque()
-        self._skipped: LaserScan | None = None
-        self._has_warned = False
-        self._subscription = SensorSubscription(node, node.diagnostics, LaserScan, SCAN, self._on_scan, resume_stamp)
-
-    @property
-    def waiting_count(self) -> int:
-        """Number of scans that wait for the laser's transform."""
-        return len(self._waiting)
-
-    def start(self) -> None:
-        """Subscribe; what was missed since :meth:`stop` comes first, where the publisher is latched."""
-        self.last_scan_at = time.monotonic()
-        self.monitor.start()
-        self._subscription.start()
-
-    def stop(self) -> None:
-        """Unsubscribe."""
-        self._subscription.stop()
-
-    def discard_waiting(self) -> None:
-        """Drop the scans that wait for the laser's transform."""
-        self._waiting.clear()
-
-    def reset_stamp_order(self) -> None:
-        """Accept any stamp of the next scan."""
-        self.monitor.reset()
-        self._subscription.reset_order()
-
-    def pause(self, *, on: bool) -> None:
-        """Skip scans from now on, or resume."""
-        self.is_paused = on
-        self._node.diagnostics.values["paused"] = "yes, scans are passed over" if on else "no"
-
-    def process_skipped(self) -> None:
-        """After a pause, process its last scan, by which the robot is found again."""
-        skipped, self._skipped = self._skipped, None
-        if skipped is not None and not self.is_paused:
-            self._enqueue(skipped)
-
-    def count_scan(self) -> None:
-        """Count a scan that has come."""
-        self.last_scan_at = time.monotonic()
-        self.monitor.note_scan()
-        self._node.diagnostics.received["Scan"] += 1
-
-    def _on_scan(self, message: LaserScan) -> None:
-        self.count_scan()
-        if self.is_paused:
-            self._count_dropped(self._skipped is not None)
-            self._skipped = message
-            return
-        self._enqueue(message)
-
-    def _enqueue(self, message: LaserScan) -> None:
-        """Process a scan as soon as its laser's transform is known."""
-        if self._subscription.is_best_effort and self._node.process.queued_scans + self.waiting_count >= _LIVE_QUEUE:
-            self._count_dropped(1)
-            self._node.diagnostics.warn(
-                "scans come faster than they can be worked off: some are dropped, lower filter.particles"
-            )
-            return
-        if not self._waiting:
-            self._waiting_since, self._has_warned = time.monotonic(), False
-        self._waiting.append(message)
-        self._node.deliver_ready_scans()
-
-    def _count_dropped(self, count: int) -> None:
-        self.dropped_count += count
-        self._node.diagnostics.values["dropped scans"] = self.dropped_count
-
-    def deliver_ready(self) -> None:
-        """Deliver the scans whose laser's transform is known."""
-        while self._waiting:
-            scan = self._mountings.convert_scan(self._waiting[0])
-            if scan is None:
-                return
-            self._waiting.popleft()
-            self._node.deliver(scan)
-
-    def warn_if_waiting(self) -> None:
-        """Report scans that wait for long: first as a warning, then as a fault.
-
-        When many nodes start, DDS may take that long to bring latched transforms.
-        """
-        now = time.monotonic()
-        if not self._waiting or now - self._waiting_since <= 2 * PERIOD:
-            return
-        report = self._node.diagnostics.fail if self._has_warned else self._node.diagnostics.warn
-        report(self._mountings.missing_transform_text(self._waiting[0], self.waiting_count))
-        self._has_warned = True
-        self._waiting_since = now + 10 * PERIOD

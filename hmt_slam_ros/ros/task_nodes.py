@@ -202,9 +202,9 @@ class TaskNode(ManagedNode):
 
         :raises HmtSlamError: then, since the map stays incomplete.
         """
-        if self._inbox.fault is not None:
+        if self._inbox.order.fault is not None:
             self.deactivate_node()
-            raise HmtSlamError(self._inbox.fault)
+            raise HmtSlamError(self._inbox.order.fault)
 
     def _on_task(self, message: String) -> None:
         try:
