@@ -55,7 +55,7 @@ setup(
     entry_points={
         "console_scripts": [
             f"hmt_slam = {NAME}.cli.main:main",
-            *(f"hmt_slam_{node} = {TABLE['console_script'](node)}" for node in NODES),
+            *(f"hmt_slam_{node} = {TABLE['RUN_NODE']}:main" for node in NODES),
         ],
     },
 )

@@ -23,7 +23,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.process_table import node_command, process_names
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.domain import own_domain
+from hmt_slam_ros.ros.node_processes import own_domain
 from hmt_slam_ros.ros.topics import DOCUMENTS
 
 Parameters = Mapping[str, str | float | list[float]]

@@ -26,11 +26,9 @@ from hmt_slam_ros.messages.documents import RobotStatus, decode
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.domain import own_domain
 from hmt_slam_ros.ros.execution import wait_until_alone
-from hmt_slam_ros.ros.replay import NodeProcesses
-from hmt_slam_ros.ros.topics import DIAGNOSTICS, ROBOT_STATUS
-from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.ros.node_processes import NodeProcesses, own_domain
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, ROBOT_STATUS, TFMessage
 from hmt_slam_ros.sensors import Scan
 
 WORLD = "office"

@@ -16,7 +16,7 @@ _DOCUMENTS = "hmt_slam_ros.messages.documents"
 _ROS = "hmt_slam_ros.ros"
 
 RUN_NODE = f"{_ROS}.run_node"
-"""Module that runs any node; for a process without a node module of its own it makes a plain process node."""
+"""Module that runs any node by its name."""
 
 COORDINATOR = "slam"
 """The process that starts coordinated requests; all others take part."""
@@ -28,13 +28,13 @@ class NodeRow:
 
     :ivar name: name of the node and of its executable.
     :ivar title: its purpose in a few words.
-    :ivar node_module: module with its function ``main``, empty where :data:`RUN_NODE` makes the node.
+    :ivar node_class: "module:Class" of the node, made with its name and run by ``spin``; empty without an executable.
     :ivar consumes: names of the message classes that it receives.
     """
 
     name: str
     title: str
-    node_module: str = ""
+    node_class: str = ""
     consumes: tuple[str, ...] = ()
 
 
@@ -49,6 +49,7 @@ class ProcessRow(NodeRow):
     :ivar produces: names of the message classes that it sends; ``Notice`` is implied.
     """
 
+    node_class: str = f"{_ROS}.process_node:ProcessNode"
     factory: str = ""
     state: str = ""
     produces: tuple[str, ...] = ()
@@ -92,7 +93,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
     ProcessRow(
         name="slam",
         title="metric SLAM in the local area",
-        node_module=f"{_ROS}.slam_node",
+        node_class=f"{_ROS}.slam_node:SlamNode",
         consumes=("Scan", "Odometry", "PoseReset", "Hypotheses", "ClosureDecision", "EndOfLog"),
         factory=f"{_COMPOSITION}:metric_slam",
         state="hmt_slam_ros.metric_slam.slam:SlamState",
@@ -109,7 +110,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
     ProcessRow(
         name="tsbi",
         title="Bayesian inference of the topology",
-        node_module=f"{_ROS}.tsbi_node",
+        node_class=f"{_ROS}.publishing_nodes:TsbiNode",
         consumes=("TrackingReset", "Keyframe", "AreaEvents", "ClosureDecision"),
         factory=f"{_COMPOSITION}:topological_inference",
         state="hmt_slam_ros.topological_inference.tsbi:TsbiState",
@@ -118,7 +119,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
     ProcessRow(
         name="tlca",
         title="loop closure acceptance and the global map",
-        node_module=f"{_ROS}.tlca_node",
+        node_class=f"{_ROS}.publishing_nodes:TlcaNode",
         consumes=("Keyframe", "Hypotheses"),
         factory="hmt_slam_ros.loop_closure.tlca:Tlca",
         state="hmt_slam_ros.loop_closure.tlca:TlcaState",
@@ -127,7 +128,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
     ProcessRow(
         name="rtl",
         title="real-time localization",
-        node_module=f"{_ROS}.rtl_node",
+        node_class=f"{_ROS}.publishing_nodes:RtlNode",
         consumes=("Odometry", "TrackingReset", "LocalEstimate", "Hypotheses", "ClosureDecision"),
         factory="hmt_slam_ros.real_time_localization.rtl:Rtl",
         state="hmt_slam_ros.real_time_localization.rtl:RtlState",
@@ -137,18 +138,20 @@ PROCESSES: tuple[ProcessRow, ...] = (
 """The processes, in the order in which messages are delivered."""
 
 COMPANIONS: tuple[NodeRow, ...] = (
-    NodeRow("robot", "replay of a log, or simulation", f"{_ROS}.robot_node", ("VelocityCommand", "TaskResult")),
-    NodeRow("view", "live page", f"{_ROS}.view_node"),
+    NodeRow(
+        "robot", "replay of a log, or simulation", f"{_ROS}.robot_node:RobotNode", ("VelocityCommand", "TaskResult")
+    ),
+    NodeRow("view", "live page", f"{_ROS}.view_node:ViewNode"),
     NodeRow(
         "explorer",
         "exploration",
-        f"{_ROS}.explorer_node",
+        f"{_ROS}.task_nodes:ExplorerNode",
         ("Task", "Scan", "RealTimePose", "Keyframe", "Hypotheses", "ClosureDecision"),
     ),
     NodeRow(
         "pilot",
         "localization and navigation among places",
-        f"{_ROS}.pilot_node",
+        f"{_ROS}.task_nodes:PilotNode",
         ("Task", "Odometry", "Scan", "RealTimePose", "Keyframe", "Hypotheses", "ClosureDecision"),
     ),
 )
@@ -231,11 +234,6 @@ def consumer_count(message: str) -> int:
 def topic_of(message: str) -> str:
     """Topic of the documents of a message class, by its name."""
     return next(row.topic for row in DOCUMENTS if row.message.endswith(f":{message}"))
-
-
-def console_script(name: str) -> str:
-    """ "module:function" of a node's console script."""
-    return f"{node_row(name).node_module or RUN_NODE}:main"
 
 
 def node_command(name: str) -> list[str]:

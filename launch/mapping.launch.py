@@ -1,14 +1,23 @@
-"""Mapping with a live robot: the processes, which want /scan, /odom and the transform from base to laser."""
+"""Mapping with a live robot: the processes, which need /scan, /odom and the transform from base to laser."""
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, LaunchLogDir, PathJoinSubstitution
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import FindPackageShare
 
 from hmt_slam_ros.process_table import process_names
+from hmt_slam_ros.ros.launch_actions import PACKAGE, RESPAWN, common_arguments, node, switch, value
+
+PARAMETERS = {
+    "use_sim_time": bool,
+    "start_from": str,
+    "start_lost": bool,
+    "save_to": str,
+    "save_on_shutdown": bool,
+    "recovery": str,
+    "autostart": bool,
+}
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -17,73 +26,49 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _arguments() -> list[DeclareLaunchArgument]:
-    defaults = PathJoinSubstitution([FindPackageShare("hmt_slam_ros"), "config", "hmt_slam.yaml"])
-    recovery = PathJoinSubstitution([LaunchLogDir(), "recovery"])
+    modes = ["", "mapping", "localization", "lifelong"]
+    texts = {
+        "start_from": ("", "Saved map to go on from; empty for none."),
+        "save_to": ("hmt_map", "Folder for the service slam/save."),
+        "view_port": ("8800", "Port of the live page on 127.0.0.1."),
+        "recovery": (
+            PathJoinSubstitution([LaunchLogDir(), "recovery"]),
+            "Folder from which a node that was killed goes on.",
+        ),
+        "log_level": ("info", "Level of the nodes' log output."),
+    }
     return [
-        DeclareLaunchArgument("params_file", default_value=defaults, description="YAML file with the parameters."),
-        _switch("use_sim_time", "false", "Take the time from /clock, for a replay or a simulator."),
-        DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
-        DeclareLaunchArgument("start_from", default_value="", description="Saved map to go on from; empty for none."),
+        *common_arguments(),
+        *(DeclareLaunchArgument(name, default_value=text[0], description=text[1]) for name, text in texts.items()),
         DeclareLaunchArgument(
             "mode",
             default_value="",
-            choices=["", "mapping", "localization", "lifelong"],
+            choices=modes,
             description="What is done with known ground; empty for what the YAML file says.",
         ),
-        _switch("start_lost", "true", "Whether the robot may be anywhere in that map; else it is where it was."),
-        DeclareLaunchArgument("save_to", default_value="hmt_map", description="Folder for the service slam/save."),
-        _switch("save_on_shutdown", "false", "Whether the map is saved there before the nodes end."),
-        _switch("autostart", "true", "Whether the nodes begin by themselves; else a lifecycle manager leads them."),
-        _switch("view", "false", "Whether the live page is served."),
-        DeclareLaunchArgument("view_port", default_value="8800", description="Port of the live page on 127.0.0.1."),
-        DeclareLaunchArgument(
-            "recovery", default_value=recovery, description="Folder from which a node that was killed goes on."
-        ),
-        DeclareLaunchArgument("log_level", default_value="info", description="Level of the nodes' log output."),
+        switch("use_sim_time", "false", "Take the time from /clock, for a replay or a simulator."),
+        switch("start_lost", "true", "Whether the robot may be anywhere in that map; else it is where it was."),
+        switch("save_on_shutdown", "false", "Whether the map is saved there before the nodes end."),
+        switch("autostart", "true", "Whether the nodes begin by themselves; else a lifecycle manager leads them."),
     ]
-
-
-def _switch(name: str, default: str, description: str) -> DeclareLaunchArgument:
-    return DeclareLaunchArgument(name, default_value=default, choices=["true", "false"], description=description)
-
-
-def _value(name: str, kind: type) -> ParameterValue:
-    return ParameterValue(LaunchConfiguration(name), value_type=kind)
 
 
 def _processes(context: LaunchContext) -> list[Node]:
-    kinds = {"use_sim_time": bool, "start_from": str, "start_lost": bool}
-    kinds |= {"save_to": str, "save_on_shutdown": bool, "recovery": str, "autostart": bool}
-    chosen = LaunchConfiguration("mode").perform(context)
-    mode = {"mode": chosen} if chosen else {}
-    return [
-        Node(
-            package="hmt_slam_ros",
-            executable=process,
-            namespace=LaunchConfiguration("namespace"),
-            parameters=[
-                LaunchConfiguration("params_file"),
-                {name: _value(name, kind) for name, kind in kinds.items()} | mode,
-            ],
-            ros_arguments=["--log-level", LaunchConfiguration("log_level")],
-            output="screen",
-            respawn=True,
-            respawn_delay=1.0,
-            respawn_max_retries=3,
-        )
-        for process in process_names()
-    ]
+    parameters = {name: value(name, kind) for name, kind in PARAMETERS.items()}
+    mode = LaunchConfiguration("mode").perform(context)
+    if mode:
+        parameters["mode"] = mode
+    log_level = ["--log-level", LaunchConfiguration("log_level")]
+    return [node(process, parameters, ros_arguments=log_level, **RESPAWN) for process in process_names()]
 
 
 def _view() -> Node:
     return Node(
-        package="hmt_slam_ros",
+        package=PACKAGE,
         executable="view",
         namespace=LaunchConfiguration("namespace"),
-        parameters=[{"port": _value("view_port", int)}],
+        parameters=[{"port": value("view_port", int)}],
         output="screen",
-        respawn=True,
-        respawn_delay=1.0,
-        respawn_max_retries=3,
         condition=IfCondition(LaunchConfiguration("view")),
+        **RESPAWN,
     )

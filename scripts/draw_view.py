@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 from hmt_slam_ros.process_table import node_command, process_names
-from hmt_slam_ros.ros.domain import own_domain
+from hmt_slam_ros.ros.node_processes import own_domain
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "test"))

@@ -52,7 +52,7 @@ def pytest_xdist_make_scheduler(config, log):
 def domain(monkeypatch):
     """A ROS domain in which nobody else is; set for this process and its children."""
     pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
-    from hmt_slam_ros.ros.domain import own_domain  # noqa: PLC0415  only where there is ROS
+    from hmt_slam_ros.ros.node_processes import own_domain  # noqa: PLC0415  only where there is ROS
 
     with own_domain() as number:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(number))

@@ -6,11 +6,11 @@ import sys
 
 import pytest
 
-from hmt_slam_ros.process_table import console_script, process_names
+from hmt_slam_ros.process_table import node_names, node_row
 
-# Modules that a console script, `ros2 run` or `python -m` starts.
-NODES = (*process_names(), "robot")
-ENTRIES = ("hmt_slam_ros.cli.main", *(console_script(node).partition(":")[0] for node in NODES))
+# Modules of the commands and the nodes.
+NODES = sorted({node_row(node).node_class.partition(":")[0] for node in node_names()})
+ENTRIES = ("hmt_slam_ros.cli.main", *NODES)
 WORK = """
 import numpy as np, scipy.linalg
 scipy.linalg.eigh(np.eye(300) @ np.eye(300))
@@ -20,8 +20,6 @@ THREADS = "import os; print(len(os.listdir('/proc/self/task')))"
 # 20 MB go and come back as less, behind which a small object stays.
 HEAP = """
 import numpy as np
-
-from hmt_slam_ros.process_table import console_script, process_names
 def resident():
     return int(open("/proc/self/statm").read().split()[1]) * 4096
 first = np.ones(20_000_000, np.uint8); del first

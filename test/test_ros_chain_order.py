@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
 from hmt_slam_ros.messages.messages import AreaEvents, ClosureDecision, Hypotheses, Keyframe
-from hmt_slam_ros.ros.inbox import CHAIN, ChainOrder
+from hmt_slam_ros.ros.message_io import CHAIN, ChainOrder
 
 
 def message(kind, sequence):

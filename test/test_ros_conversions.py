@@ -18,7 +18,7 @@ from hmt_slam_ros.grids.occupancy_map import FREE, OCCUPIED, UNKNOWN, OccupancyI
 from hmt_slam_ros.messages.messages import Hypotheses, Hypothesis, ScanPoses
 from hmt_slam_ros.ros import conversions
 from hmt_slam_ros.ros.map_view import grid_message
-from hmt_slam_ros.ros.tsbi_node import pmf_message
+from hmt_slam_ros.ros.publishing_nodes import pmf_message
 from hmt_slam_ros.sensors import Odometry, Scan
 
 STAMPS = st.integers(0, 2**31 * 10**9 - 1)

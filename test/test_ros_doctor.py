@@ -19,7 +19,7 @@ from test_ros_states import SHUTDOWN, Manager
 from hmt_slam_ros.cli.main import main
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.ros import conversions
-from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.ros.topics import TFMessage
 from hmt_slam_ros.sensors import Odometry, Scan
 
 WORLD = "sim:office,seed=3,beams=181"

@@ -6,8 +6,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from hmt_slam_ros.ros import domain as domains
-from hmt_slam_ros.ros.domain import own_domain
+from hmt_slam_ros.ros import node_processes
+from hmt_slam_ros.ros.node_processes import own_domain
 
 
 def test_two_at_a_time_get_different_domains():
@@ -33,7 +33,7 @@ def test_a_domain_with_a_participant_is_left_alone(monkeypatch):
 
 
 def test_where_all_are_taken_it_is_told(monkeypatch):
-    monkeypatch.setattr(domains, "_DOMAINS", range(1, 2))
-    monkeypatch.setattr(domains, "_is_silent", lambda _: False)
-    with pytest.raises(domains.HmtSlamError, match="are in use"), own_domain():
+    monkeypatch.setattr(node_processes, "_DOMAINS", range(1, 2))
+    monkeypatch.setattr(node_processes, "_is_silent", lambda _: False)
+    with pytest.raises(node_processes.HmtSlamError, match="are in use"), own_domain():
         pass

@@ -25,8 +25,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.documents import decode, encode
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.ros import conversions, topics
-from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, MAP, POSE, ROBOT_STATUS, SCAN
-from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, MAP, POSE, ROBOT_STATUS, SCAN, TFMessage
 from hmt_slam_ros.saved_map.folder import FORMAT, VERSION, FolderReader
 from hmt_slam_ros.sensors import Odometry, Scan
 

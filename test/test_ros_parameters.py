@@ -20,10 +20,13 @@ def make(domain):
     contexts = []
 
     def make(*arguments, changeable=()):
+        class TestedNode(ConfiguredNode):
+            changeable_parameters = changeable
+
         context = Context()
         context.init(args=["--ros-args", *arguments], domain_id=domain)
         contexts.append(context)
-        return ConfiguredNode("tested", changeable, context=context)
+        return TestedNode("tested", context=context)
 
     yield make
     for context in contexts:

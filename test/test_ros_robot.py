@@ -26,8 +26,7 @@ from hmt_slam_ros.messages.documents import encode
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.ros import conversions, topics
-from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, ROBOT_STATUS
-from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, ROBOT_STATUS, TFMessage
 from hmt_slam_ros.sensors import Scan
 
 SCANS = [record.measurement for record in Corridor().records() if isinstance(record.measurement, Scan)]

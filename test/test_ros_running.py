@@ -12,9 +12,9 @@ import rclpy
 from rclpy.node import Node
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.ros import map_services
 from hmt_slam_ros.ros.execution import run
-from hmt_slam_ros.ros.outbox import RCLError
+from hmt_slam_ros.ros.message_io import RCLError
+from hmt_slam_ros.ros.process_node import ProcessNode
 
 
 def shut_down_while_made():
@@ -42,7 +42,7 @@ def fail_in_rcl():
 
 
 def status_of(make):
-    raise SystemExit(run(make, map_services.spin))
+    raise SystemExit(run(make, ProcessNode.spin))
 
 
 @pytest.mark.parametrize(

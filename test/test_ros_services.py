@@ -22,8 +22,7 @@ from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import pose_from_message
-from hmt_slam_ros.ros.topics import KEYFRAMES, MAP
-from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.ros.topics import KEYFRAMES, MAP, TFMessage
 
 TRANSFORMS = {"tf", "tf_static"} if TFMessage else set()
 NAMED = {value for name, value in vars(topics).items() if name.isupper() and isinstance(value, str)}

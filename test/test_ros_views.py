@@ -32,8 +32,7 @@ from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
-from hmt_slam_ros.ros.topics import DIAGNOSTICS, FINISHED, GRAPH, HMT_POSE, MAP, PARTICLES, PMF, POSE
-from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, FINISHED, GRAPH, HMT_POSE, MAP, PARTICLES, PMF, POSE, TFMessage
 from hmt_slam_ros.sensors import Scan
 
 BUNDLED = Path(__file__).resolve().parent.parent / "data" / "malaga_one_loop"

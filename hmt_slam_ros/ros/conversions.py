@@ -1,7 +1,7 @@
-"""Between the project's values and ROS messages.
+"""Conversions between the values of this package and ROS messages.
 
-Bulk arrays go through ``array.array`` and the buffer protocol: a list, or the assignment of a numpy array, costs ten
-to a thousand times as much. Floats of a LaserScan are float32 in ROS; everything else comes back as it was.
+Bulk arrays go through ``array.array`` and the buffer protocol: lists and numpy arrays cost ten to a thousand times as
+much. A LaserScan holds float32; all else survives a round trip bit for bit.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from array import array
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -28,19 +28,19 @@ from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
 from numpy.typing import NDArray
 from sensor_msgs.msg import LaserScan
-from std_msgs.msg import Header
+from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, MultiArrayLayout
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs.mounting import heading_from_quaternion
+from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.messages import ScanPoses
 from hmt_slam_ros.sensors import Odometry, Scan
 
-_SECOND = 1_000_000_000
-# Rows and columns of (x, y, theta) in the 6 x 6 covariance of ROS, which is (x, y, z, roll, pitch, yaw).
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
-# Units in the last place by which a quaternion may be off, the smallest first.
+"""Rows and columns of (x, y, theta) in the 6 x 6 covariance of ROS, which is (x, y, z, roll, pitch, yaw)."""
 _NUDGES = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (2, 0), (-2, 0), (0, 2), (0, -2))
+"""Corrections of (z, w) of a quaternion that are tried, units in the last place, the smallest first."""
 _SCAN_POSES_FRAME = re.compile(r"hypothesis_(\d+)/scan_(\d+)")
 _AREA_FRAME = re.compile(r"area_(\d+)")
 _KEYFRAME_FRAME = re.compile(r"keyframe_(\d+)(?:/reset_(\d+))?")
@@ -48,26 +48,25 @@ _KEYFRAME_FRAME = re.compile(r"keyframe_(\d+)(?:/reset_(\d+))?")
 
 def time_message(stamp: int) -> Time:
     """ROS time of a stamp in ns."""
-    seconds, nanoseconds = divmod(stamp, _SECOND)
+    seconds, nanoseconds = divmod(stamp, NANOSECONDS)
     return Time(sec=seconds, nanosec=nanoseconds)
 
 
 def stamp_from_time(time: Time) -> int:
     """Stamp in ns of a ROS time."""
-    return int(time.sec) * _SECOND + int(time.nanosec)
+    return int(time.sec) * NANOSECONDS + int(time.nanosec)
 
 
 def header_message(stamp: int, frame: str) -> Header:
-    """Header from a stamp in ns and the name of a frame."""
+    """Header of a stamp in ns and the name of a frame."""
     return Header(stamp=time_message(stamp), frame_id=frame)
 
 
 def quaternion_message(theta: float) -> Quaternion:
-    """Rotation by ``theta`` rad, in [-pi, pi), about z, from which the receiver gets ``theta`` back bit for bit.
+    """Rotation about z by ``theta`` in [-pi, pi) rad, from which a receiver gets ``theta`` bit for bit.
 
-    Sine and cosine are rounded, so the angle may come back with another last bit, and a run of the nodes would drift
-    away from the lock-step run. The last bits of the quaternion are chosen such that it does not, for any angle of
-    1e-300 rad or more.
+    Rounded sine and cosine may change the last bit of the angle, and a run of the nodes would differ from the lock-step
+    run. So the last bits of the quaternion are chosen to restore any angle of 1e-300 rad or more.
     """
     sin, cos = math.sin(0.5 * theta), math.cos(0.5 * theta)
     for steps_z, steps_w in _NUDGES:
@@ -85,8 +84,8 @@ def pose_message(pose: NDArray[np.float64]) -> Pose:
 
 def pose_from_message(pose: Pose) -> NDArray[np.float64]:
     """(x, y, theta) of a ROS pose."""
-    turn = pose.orientation
-    return np.array([pose.position.x, pose.position.y, heading_from_quaternion((turn.x, turn.y, turn.z, turn.w))])
+    q = pose.orientation
+    return np.array([pose.position.x, pose.position.y, heading_from_quaternion((q.x, q.y, q.z, q.w))])
 
 
 def transform_message(stamp: int, parent: str, child: str, parent_T_child: NDArray[np.float64]) -> TransformStamped:
@@ -97,7 +96,7 @@ def transform_message(stamp: int, parent: str, child: str, parent_T_child: NDArr
 
 
 def scan_message(scan: Scan, frame: str) -> LaserScan:
-    """ROS scan; the pose of the laser is left to the transform of ``frame``."""
+    """ROS scan in the laser's ``frame``; the pose of the laser is not part of it."""
     return LaserScan(
         header=header_message(scan.stamp, frame),
         angle_min=scan.angle_min,
@@ -111,15 +110,15 @@ def scan_message(scan: Scan, frame: str) -> LaserScan:
 
 
 def ranges_from_message(message: LaserScan) -> NDArray[np.float32]:
-    """Ranges, shape (n,), m, not to be written to."""
+    """Ranges (n,), m, read-only."""
     return np.frombuffer(message.ranges, dtype=np.float32) if len(message.ranges) else np.zeros(0, dtype=np.float32)
 
 
 def scan_from_message(message: LaserScan, laser_pose: NDArray[np.float64], angle_sign: float = 1.0) -> Scan:
-    """A scan.
+    """Scan of a ROS scan.
 
-    :param laser_pose: shape (3,), ``base_T_laser``.
-    :param angle_sign: -1.0 for a laser that is mounted upside down, whose angles count the other way round.
+    :param laser_pose: ``base_T_laser`` (3,).
+    :param angle_sign: -1.0 for a laser that is mounted upside down, else 1.0.
     """
     return Scan(
         stamp_from_time(message.header.stamp),
@@ -143,17 +142,16 @@ def odometry_message(reading: Odometry, odom_frame: str, base_frame: str) -> Odo
 
 
 def odometry_from_message(message: OdometryMessage) -> Odometry:
-    """An odometry reading."""
+    """Odometry reading of ROS odometry."""
     return Odometry(stamp_from_time(message.header.stamp), pose_from_message(message.pose.pose))
 
 
 def pose_with_covariance_message(stamp: int, frame: str, belief: PoseGaussian) -> PoseWithCovarianceStamped:
-    """ROS pose with covariance.
+    """ROS pose with covariance, with x and y along the axes of ``frame``.
 
-    Ours lives in the right tangent frame, that is, in the robot's axes; ROS gives x and y in the axes of ``frame``.
+    The covariance of a ``PoseGaussian`` is in the right tangent frame, along the robot's axes.
     """
-    sin, cos = math.sin(belief.mean[2]), math.cos(belief.mean[2])
-    axes = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    axes = _rotation(belief.mean[2])
     covariance = np.zeros((6, 6))
     covariance[_PLANAR] = axes @ belief.covariance @ axes.T
     return PoseWithCovarianceStamped(
@@ -165,9 +163,14 @@ def pose_with_covariance_message(stamp: int, frame: str, belief: PoseGaussian) -
 def gaussian_from_message(message: PoseWithCovariance) -> PoseGaussian:
     """The inverse of :func:`pose_with_covariance_message`."""
     mean = pose_from_message(message.pose)
-    sin, cos = math.sin(mean[2]), math.cos(mean[2])
-    axes = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    axes = _rotation(mean[2])
     return PoseGaussian(mean, axes.T @ np.reshape(message.covariance, (6, 6))[_PLANAR] @ axes)
+
+
+def _rotation(theta: float) -> NDArray[np.float64]:
+    """Rotation by ``theta`` rad of (x, y, theta), shape (3, 3)."""
+    sin, cos = math.sin(theta), math.cos(theta)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def area_frame(area: int) -> str:
@@ -176,52 +179,48 @@ def area_frame(area: int) -> str:
 
 
 def area_from_frame(frame: str) -> int:
-    """The area that a frame is named after.
+    """The area of an area's frame.
 
-    :raises HmtSlamError: where it is named after something else.
+    :raises HmtSlamError: for any other frame.
     """
     return int(_match_frame(_AREA_FRAME, frame)[1])
 
 
 def keyframe_frame(keyframe: int, reset_number: int = 0) -> str:
-    """Name of a keyframe's frame.
-
-    :param reset_number: number of the request after which slam began anew, 0 before the first.
-    """
+    """Name of a keyframe's frame; ``reset_number`` is that of the last reset, 0 before the first."""
     return f"keyframe_{keyframe}/reset_{reset_number}" if reset_number else f"keyframe_{keyframe}"
 
 
 def keyframe_from_frame(frame: str) -> tuple[int, int]:
-    """The keyframe that a frame is named after, and the request after which slam had begun anew.
+    """The keyframe and the reset number of a keyframe's frame.
 
-    :raises HmtSlamError: where it is named after something else.
+    :raises HmtSlamError: for any other frame.
     """
-    found = _match_frame(_KEYFRAME_FRAME, frame)
-    return int(found[1]), int(found[2] or 0)
+    match = _match_frame(_KEYFRAME_FRAME, frame)
+    return int(match[1]), int(match[2] or 0)
 
 
 def path_message(scan_poses: ScanPoses) -> Path:
-    """Scan poses as a path: every pose in the frame of its own keyframe."""
+    """Scan poses as a path, every pose in the frame of its keyframe."""
     rows = zip(scan_poses.stamps.tolist(), scan_poses.keyframes.tolist(), scan_poses.poses, strict=True)
     poses = [
-        PoseStamped(header=header_message(stamp, keyframe_frame(anchor)), pose=pose_message(pose))
-        for stamp, anchor, pose in rows
+        PoseStamped(header=header_message(stamp, keyframe_frame(keyframe)), pose=pose_message(pose))
+        for stamp, keyframe, pose in rows
     ]
-    first = int(scan_poses.stamps[0]) if scan_poses.stamps.size else 0
-    return Path(
-        header=header_message(first, f"hypothesis_{scan_poses.hypothesis}/scan_{scan_poses.first_scan}"), poses=poses
-    )
+    stamp = int(scan_poses.stamps[0]) if scan_poses.stamps.size else 0
+    frame = f"hypothesis_{scan_poses.hypothesis}/scan_{scan_poses.first_scan}"
+    return Path(header=header_message(stamp, frame), poses=poses)
 
 
 def scan_poses_from_message(message: Path) -> ScanPoses:
     """The inverse of :func:`path_message`.
 
-    :raises HmtSlamError: where the frames have other names.
+    :raises HmtSlamError: for other names of frames.
     """
-    found = _match_frame(_SCAN_POSES_FRAME, message.header.frame_id)
+    match = _match_frame(_SCAN_POSES_FRAME, message.header.frame_id)
     return ScanPoses(
-        int(found[1]),
-        int(found[2]),
+        int(match[1]),
+        int(match[2]),
         np.array([stamp_from_time(pose.header.stamp) for pose in message.poses], dtype=np.int64),
         np.array([keyframe_from_frame(pose.header.frame_id)[0] for pose in message.poses], dtype=np.int64),
         np.array([pose_from_message(pose.pose) for pose in message.poses], dtype=np.float64).reshape(-1, 3),
@@ -229,12 +228,18 @@ def scan_poses_from_message(message: Path) -> ScanPoses:
 
 
 def _match_frame(pattern: re.Pattern[str], frame: str) -> re.Match[str]:
-    found = pattern.fullmatch(frame)
-    if found is None:
+    match = pattern.fullmatch(frame)
+    if match is None:
         raise HmtSlamError(f"frame '{frame}' is not of the form {pattern.pattern}: run the same version everywhere")
-    return found
+    return match
 
 
-def flatten_rows(rows: Iterable[Iterable[float]]) -> array[float]:
-    """Rows of numbers one after the other, as a MultiArray holds them."""
-    return array("d", [value for row in rows for value in row])
+def table_message(label: str, columns: Sequence[str], rows: Sequence[Sequence[float]]) -> Float64MultiArray:
+    """Table of numbers; the labels of its two dimensions are ``label`` and the names of the columns."""
+    width = len(columns)
+    layout = [
+        MultiArrayDimension(label=label, size=len(rows), stride=width * len(rows)),
+        MultiArrayDimension(label=",".join(columns), size=width, stride=width),
+    ]
+    data = array("d", [value for row in rows for value in row])
+    return Float64MultiArray(layout=MultiArrayLayout(dim=layout), data=data)

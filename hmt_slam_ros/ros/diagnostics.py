@@ -1,4 +1,4 @@
-"""What a node counts and measures of itself, and how it tells."""
+"""Diagnostics of a node: counts, durations, memory and the last fault, on /diagnostics and /hmt/cost."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from pathlib import Path
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+from std_msgs.msg import Float64MultiArray
 
+from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.messages import Keyframe, LocalEstimate, Message
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import flatten_rows
+from hmt_slam_ros.ros.conversions import table_message
 from hmt_slam_ros.ros.topics import COST, DIAGNOSTICS
 
-PERIOD = 1.0  # s
+PERIOD = 1.0
+"""Time between two messages on /diagnostics, s."""
 STATE, ACTIVE = "state", "active"
-"""The line of /diagnostics that has the state of a managed node, and the one in which it takes part."""
-
-_SECOND = 1_000_000_000
+"""Key of the lifecycle state in /diagnostics, and its value for an active node."""
 
 
 class NodeDiagnostics:
-    """Counts, durations and the last error of a node, published every second.
+    """Counts, durations and the last fault of a node, published once a second.
 
-    :ivar received: {kind of message: count}.
-    :ivar sent: {kind of message: count}.
-    :ivar values: further lines, {name: value}.
-    :ivar steady_clock: for timers.
+    :ivar received: {message type: count}.
+    :ivar sent: {message type: count}.
+    :ivar values: further entries, {name: value}.
+    :ivar steady_clock: clock for timers that run while simulated time stands still.
     """
 
     def __init__(self, node: Node) -> None:
@@ -40,12 +40,11 @@ class NodeDiagnostics:
         self._clock = Clock(clock_type=ClockType.SYSTEM_TIME)
         self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
         self._cost = node.create_publisher(Float64MultiArray, COST, topics.CHAIN)
-        # It also runs while simulated time stands still.
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(PERIOD, self.publish, clock=self.steady_clock)
 
     def clear(self) -> None:
-        """Begin to count anew."""
+        """Reset all counts and faults."""
         self.received: Counter[str] = Counter()
         self.sent: Counter[str] = Counter()
         self.values: dict[str, object] = {}
@@ -58,22 +57,22 @@ class NodeDiagnostics:
         self._handled, self._busy_seconds, self._longest = 0, 0.0, 0.0
 
     def warn(self, sentence: str) -> None:
-        """Remember and log something that the node survives; the same sentence is logged once."""
+        """Record and log a fault that the node survives; a repeated sentence is logged once."""
         self._record_fault(sentence, DiagnosticStatus.WARN)
 
     def fail(self, sentence: str) -> None:
-        """Remember and log something that the run does not survive."""
+        """Record and log a fault that the run does not survive."""
         self._record_fault(sentence, DiagnosticStatus.ERROR)
 
     def note(self, sentence: str) -> None:
-        """Log that something is well again; the last error stays to be seen."""
+        """Log information; the last fault stays in /diagnostics."""
         self._node.get_logger().info(sentence)
 
     def _record_fault(self, sentence: str, level: bytes) -> None:
         if sentence != self._error:
             self._error, self._level = sentence, max(level, self._level)
             logger = self._node.get_logger()
-            # rclpy wants a line of the program of its own for each level, and ends the node otherwise.
+            # rclpy raises where two levels are logged from one line of code.
             if level == DiagnosticStatus.ERROR:
                 logger.error(sentence)
             else:
@@ -81,24 +80,23 @@ class NodeDiagnostics:
 
     @contextmanager
     def measure(self, message: Message, outputs: list[Message]) -> Iterator[None]:
-        """Measure how long a message takes, on the account of the scan that it is about.
+        """Measure the time that a message takes, and assign it to its scan.
 
-        :param outputs: filled by the body with the answers.
+        :param message: the input.
+        :param outputs: filled by the body with the outputs.
         """
         begin = time.perf_counter()
         yield
         seconds = time.perf_counter() - begin
-        self._handled, self._busy_seconds, self._longest = (
-            self._handled + 1,
-            self._busy_seconds + seconds,
-            max(self._longest, seconds),
-        )
+        self._handled += 1
+        self._busy_seconds += seconds
+        self._longest = max(self._longest, seconds)
         self._last_stamp = _message_stamp(message, self._last_stamp)
-        scans = [answer.stamp for answer in outputs if isinstance(answer, LocalEstimate)] or [self._last_stamp]
-        self._costs += [(stamp, seconds / len(scans)) for stamp in scans]
+        stamps = [output.stamp for output in outputs if isinstance(output, LocalEstimate)] or [self._last_stamp]
+        self._costs += [(stamp, seconds / len(stamps)) for stamp in stamps]
 
     def publish(self) -> None:
-        """Say everything now."""
+        """Publish diagnostics and costs now."""
         self._publish_costs()
         values = {
             **self._counts_and_rates(),
@@ -123,21 +121,21 @@ class NodeDiagnostics:
 
     @property
     def _status_text(self) -> str:
-        """The state of a node that has states, unless it takes part."""
+        """The lifecycle state, or "running" for an active node and for one without lifecycle."""
         state = str(self.values.get(STATE, ACTIVE))
         return "running" if state == ACTIVE else state
 
     def _counts_and_rates(self) -> dict[str, object]:
-        """How many messages of each kind there were, and how many a second since the last time."""
+        """Counts by message type, and their rates since the last call."""
         now = time.monotonic()
         counts = {
             f"{verb} {kind}": count
             for verb, counter in (("received", self.received), ("sent", self.sent))
             for kind, count in sorted(counter.items())
         }
-        since, self._previous_counts_at = max(now - self._previous_counts_at, 1e-3), now
+        seconds, self._previous_counts_at = max(now - self._previous_counts_at, 1e-3), now
         last, self._previous_counts = self._previous_counts, counts
-        rates = {f"{name} a second": f"{(count - last.get(name, 0)) / since:.1f}" for name, count in counts.items()}
+        rates = {f"{name} a second": f"{(count - last.get(name, 0)) / seconds:.1f}" for name, count in counts.items()}
         return {**counts, **rates}
 
     def _publish_costs(self) -> None:
@@ -146,36 +144,32 @@ class NodeDiagnostics:
             self._costs = []
 
 
-def _message_stamp(message: Message, otherwise: int) -> int:
-    """Stamp of the scan or odometry reading that a message is about, ns."""
+def _message_stamp(message: Message, default: int) -> int:
+    """Stamp of the scan or odometry reading of a message, ns."""
     if isinstance(message, Keyframe):
         return message.scan.stamp
-    return int(getattr(message, "stamp", otherwise))
+    return int(getattr(message, "stamp", default))
 
 
 def _cost_message(name: str, costs: Sequence[tuple[int, float]]) -> Float64MultiArray:
-    """Rows of (stamp s, stamp ns, seconds of computing); a stamp as one float64 would lose its last digits."""
-    rows = [(*divmod(stamp, _SECOND), seconds) for stamp, seconds in costs]
-    layout = [
-        MultiArrayDimension(label=name, size=len(rows), stride=3 * len(rows)),
-        MultiArrayDimension(label="stamp_sec,stamp_nanosec,seconds", size=3, stride=3),
-    ]
-    return Float64MultiArray(layout=MultiArrayLayout(dim=layout), data=flatten_rows(rows))
+    """Rows of (stamp in s, its rest in ns, seconds of computing); one float64 cannot hold a stamp exactly."""
+    rows = [(*divmod(stamp, NANOSECONDS), seconds) for stamp, seconds in costs]
+    return table_message(name, ("stamp_sec", "stamp_nanosec", "seconds"), rows)
 
 
 def peak_rss(process: int | str = "self") -> int:
-    """Largest resident memory of an OS process, bytes; 0 where the system does not tell."""
+    """Largest resident memory of an OS process, bytes; 0 where it is unknown."""
     return _memory(process, "VmHWM")
 
 
 def current_rss(process: int | str = "self") -> int:
-    """Resident memory of an OS process now, bytes; 0 where the system does not tell."""
+    """Current resident memory of an OS process, bytes; 0 where it is unknown."""
     return _memory(process, "VmRSS")
 
 
-def _memory(process: int | str, which: str) -> int:
+def _memory(process: int | str, key: str) -> int:
     try:
         lines = Path(f"/proc/{process}/status").read_text(encoding="ascii", errors="replace").splitlines()
     except OSError:
         return 0
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(which)), 0)
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(key)), 0)

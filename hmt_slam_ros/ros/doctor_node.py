@@ -1,4 +1,4 @@
-"""A node that listens for a while to a running system, for ``hmt_slam doctor --live``."""
+"""Node that examines a running system for some time, for ``hmt_slam doctor --live``."""
 
 from __future__ import annotations
 
@@ -40,36 +40,37 @@ from hmt_slam_ros.logs.stamps import running_stamps
 from hmt_slam_ros.process_table import producer, topic_of
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import STATE
-from hmt_slam_ros.ros.topics import DIAGNOSTICS
-from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, TFMessage
 from hmt_slam_ros.sensors import Odometry, Scan
 
 _ARGUMENT_ERRORS = (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError)
-# Heard by best effort, which every publisher offers.
 _BEST_EFFORT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
-# Nodes that are there at all are found in this time, s.
+"""Profile of a reader that every publisher is compatible with."""
 _DISCOVERY_TIMEOUT = 5.0
+"""Time in which DDS finds the first other node, s."""
+_SPIN = 0.05  # s
 _USE_SIM_TIME, _LASER_POSE = "use_sim_time", "laser_pose"
 _GRAPH_ONLY_TOPICS = ("map", "pose", *map(topic_of, ("KeyframeHeader", "Hypotheses", "ClosureDecision")))
 _ODOM_FRAME, _BASE_FRAME = "odom", "base_link"
-_MAP_TO_ODOM_NODE = producer("RealTimePose")  # the node of ours that publishes that
+_MAP_TO_ODOM_NODE = producer("RealTimePose")
 
 
 def examine_running(seconds: float, ros_arguments: Sequence[str]) -> list[Finding]:
-    """Listen to the running system and judge it.
+    """Findings about the running system, the most severe first.
 
-    :param ros_arguments: behind ``--ros-args``.
-    :raises HmtSlamError: for a time that is none, or arguments that ROS does not take.
+    :param seconds: time to listen.
+    :param ros_arguments: those after ``--ros-args``.
+    :raises HmtSlamError: for an invalid time, or arguments that ROS refuses.
     """
     if not 0.0 < seconds < float("inf"):
         raise HmtSlamError(f"--seconds {seconds:g} is no time to listen: give more than 0")
     with _make_node(ros_arguments) as (node, executor):
         begin = time.monotonic()
         while not node.other_nodes and time.monotonic() < begin + _DISCOVERY_TIMEOUT:
-            executor.spin_once(timeout_sec=0.05)
+            executor.spin_once(timeout_sec=_SPIN)
         begin = time.monotonic()
         while time.monotonic() < begin + seconds:
-            executor.spin_once(timeout_sec=0.05)
+            executor.spin_once(timeout_sec=_SPIN)
             node.request_parameters()
         return sorted_findings(node.findings(seconds))
 
@@ -95,7 +96,7 @@ def _make_node(ros_arguments: Sequence[str]) -> Iterator[tuple[DoctorNode, Singl
 
 
 class DoctorNode(Node):
-    """Hears sensors, transforms and diagnostics, and looks at the graph."""
+    """Collects sensor messages, transforms, diagnostics and the ROS graph."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(f"doctor_{os.getpid()}", context=context, enable_rosout=False)
@@ -121,11 +122,11 @@ class DoctorNode(Node):
 
     @property
     def other_nodes(self) -> tuple[str, ...]:
-        """Names of all nodes but this one."""
+        """Names of all other nodes."""
         return tuple(name for name in self.get_node_names() if name != self.get_name())
 
     def request_parameters(self) -> None:
-        """Ask every node that was not asked so far for the parameters that matter here."""
+        """Request the relevant parameters of every node that was not asked before."""
         for name, namespace in self.get_node_names_and_namespaces():
             full = f"{namespace.rstrip('/')}/{name}"
             if full in self._parameter_futures or name == self.get_name():
@@ -134,14 +135,14 @@ class DoctorNode(Node):
                 self._parameter_clients[full] = self.create_client(GetParameters, f"{full}/get_parameters")
             client = self._parameter_clients[full]
             if client.service_is_ready():
-                # One by one: a node that lacks one of them answers nothing to all.
+                # One by one: a node that lacks one of several answers with none.
                 self._parameter_futures[full] = {
                     name: client.call_async(GetParameters.Request(names=[name]))
                     for name in (_USE_SIM_TIME, _LASER_POSE)
                 }
 
     def findings(self, seconds: float) -> list[Finding]:
-        """All that was found."""
+        """Findings about the system, and about its measurements where there are scans."""
         system = self._running_system(seconds)
         found = list(running.running_findings(system))
         if not system.topics[running.SCAN].message_count:
@@ -181,61 +182,61 @@ class DoctorNode(Node):
         for joint in message.transforms:
             parent, child = frame_name(joint.header.frame_id), frame_name(joint.child_frame_id)
             stamp = conversions.stamp_from_time(joint.header.stamp)
-            move, turn = joint.transform.translation, joint.transform.rotation
-            value = np.array([move.x, move.y, turn.z, turn.w])
+            translation, rotation = joint.transform.translation, joint.transform.rotation
+            value = np.array([translation.x, translation.y, rotation.z, rotation.w])
             last = self._last_transforms.get((parent, child))
             if last is not None and last[0] == stamp and last[1] != value.tobytes():
                 self._conflicting_transforms[f"{parent} -> {child}"] += 1
             self._last_transforms[parent, child] = (stamp, value.tobytes())
             if parent == _ODOM_FRAME:
-                heading = 2.0 * float(np.arctan2(turn.z, turn.w))
-                self._transform_odometry[child].append(Odometry(stamp, np.array([move.x, move.y, heading])))
+                heading = 2.0 * float(np.arctan2(rotation.z, rotation.w))
+                pose = np.array([translation.x, translation.y, heading])
+                self._transform_odometry[child].append(Odometry(stamp, pose))
 
     def _running_system(self, seconds: float) -> RunningSystem:
         names = (running.SCAN, running.ODOM, running.TF, running.TF_STATIC, running.CLOCK, running.ESTIMATES)
         topics = {name: self._topic(name, self._counts[name]) for name in names}
         topics |= {name: self._topic(name, None) for name in _GRAPH_ONLY_TOPICS}
-        clock = bool(topics[running.CLOCK].publishers)
+        has_clock = bool(topics[running.CLOCK].publishers)
+        with_sim_time = sorted(
+            full.lstrip("/")
+            for full in self._parameter_futures
+            if self._parameter_value(full, _USE_SIM_TIME).bool_value
+        )
         return RunningSystem(
             seconds,
             topics,
             self.other_nodes,
-            tuple(
-                sorted(
-                    full.lstrip("/")
-                    for full in self._parameter_futures
-                    if self._parameter_value(full, _USE_SIM_TIME).bool_value
-                )
-            ),
+            tuple(with_sim_time),
             tuple(self._node_statuses.values()),
-            {} if clock else {name: float(np.median(away)) for name, away in self._clock_offsets.items()},
+            {} if has_clock else {name: float(np.median(values)) for name, values in self._clock_offsets.items()},
             dict(self._conflicting_transforms),
             self._missing_laser_transform(),
         )
 
-    def _topic(self, name: str, heard: int | None) -> Topic:
+    def _topic(self, name: str, message_count: int | None) -> Topic:
         full = self.resolve_topic_name(name)
         publishers = self.get_publishers_info_by_topic(full)
         subscribers = [end for end in self.get_subscriptions_info_by_topic(full) if end.node_name != self.get_name()]
         mismatches = []
         for publisher in publishers:
             for subscriber in subscribers:
-                fit, reason = qos_check_compatible(publisher.qos_profile, subscriber.qos_profile)
-                if fit == QoSCompatibility.ERROR:
+                compatibility, reason = qos_check_compatible(publisher.qos_profile, subscriber.qos_profile)
+                if compatibility == QoSCompatibility.ERROR:
                     mismatches.append(Mismatch(publisher.node_name, subscriber.node_name, reason.strip().rstrip(".;")))
-        return Topic(heard, tuple(end.node_name for end in publishers), tuple(mismatches))
+        return Topic(message_count, tuple(end.node_name for end in publishers), tuple(mismatches))
 
     def _parameter_value(self, full: str, parameter: str) -> ParameterValue:
-        """What a node has for a parameter; a value that is not set where it has none."""
+        """A node's value of a parameter, not set where it has none."""
         future = self._parameter_futures[full][parameter]
-        answer = future.result() if future.done() and future.exception() is None else None
-        return answer.values[0] if answer is not None and answer.values else ParameterValue()
+        response = future.result() if future.done() and future.exception() is None else None
+        return response.values[0] if response is not None and response.values else ParameterValue()
 
     def _base_frame(self) -> str:
         return self._odometry_frames[1] or next(iter(self._transform_odometry), _BASE_FRAME)
 
     def _configured_mounting(self) -> Mounting | None:
-        """Where the parameter of slam says that the laser is."""
+        """The laser's mounting from the parameter of slam, None where it is not set."""
         for full in self._parameter_futures:
             value = self._parameter_value(full, _LASER_POSE)
             if full.endswith("/slam") and value.type == ParameterType.PARAMETER_DOUBLE_ARRAY:
@@ -243,8 +244,8 @@ class DoctorNode(Node):
         return None
 
     def _mounting(self, frame: str) -> Mounting | None:
-        given, pose = self._configured_mounting(), self._frame_tree.lookup_transform(self._base_frame(), frame)
-        return given if given is not None or pose is None else planar_mounting(pose, f"the laser {frame!r}")
+        configured, pose = self._configured_mounting(), self._frame_tree.lookup_transform(self._base_frame(), frame)
+        return configured if configured is not None or pose is None else planar_mounting(pose, f"the laser {frame!r}")
 
     def _missing_laser_transform(self) -> str:
         missing = sorted({frame for frame in self._scan_frames() if self._mounting(frame) is None})
@@ -259,7 +260,7 @@ class DoctorNode(Node):
         return {frame_name(message.header.frame_id) for message in self._scans}
 
     def _gather(self) -> Gatherer:
-        """The measurements in the order of their stamps, each kind as it came."""
+        """All measurements in the order of their stamps, those of one kind in the order of arrival."""
         mountings = {frame: self._mounting(frame) or Mounting(np.zeros(3), 1.0) for frame in self._scan_frames()}
         scans: list[Scan | Odometry] = [self._convert_scan(message, mountings) for message in self._scans]
         readings: list[Scan | Odometry] = [*(self._readings or self._transform_odometry[self._base_frame()])]
@@ -276,16 +277,16 @@ class DoctorNode(Node):
         return conversions.scan_from_message(message, *mountings[frame_name(message.header.frame_id)])
 
     def _message_statistics(self) -> MessageStatistics:
-        heads: dict[ScanHeader, int] = defaultdict(int)
+        headers: dict[ScanHeader, int] = defaultdict(int)
         for scan in self._scans:
             frame = frame_name(scan.header.frame_id)
-            heads[ScanHeader(frame, scan.angle_min, scan.angle_max, scan.angle_increment, len(scan.ranges))] += 1
+            headers[ScanHeader(frame, scan.angle_min, scan.angle_max, scan.angle_increment, len(scan.ranges))] += 1
         frames = self._odometry_frames if self._readings else (_ODOM_FRAME, self._base_frame())
         types = {name: kind[0] for name, kind in self.get_topic_names_and_types()}
-        joints = self._transforms.transforms
+        transforms = self._transforms.transforms
         if _MAP_TO_ODOM_NODE in self.other_nodes:
-            joints = tuple(joint for joint in joints if joint.child != frames[0])
-        return MessageStatistics(dict(self._counts), types, dict(heads), frames, joints)
+            transforms = tuple(transform for transform in transforms if transform.child != frames[0])
+        return MessageStatistics(dict(self._counts), types, dict(headers), frames, transforms)
 
 
 def _with_stamp(measurement: Scan | Odometry, stamp: int) -> Scan | Odometry:

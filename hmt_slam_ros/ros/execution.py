@@ -1,8 +1,8 @@
-"""How a node begins and ends: status 0 when told to stop, one sentence and status 2 for a fault, never a traceback.
+"""Start and end of a node: exit status 0 after a signal, one sentence and status 2 for a fault, never a traceback.
 
-Fast DDS 2.14 may never come back from the destruction of a participant while others leave: the call
-``DomainParticipant::set_listener`` polls a mutex without end, and the thread that it waits for never gets it. rclpy
-calls it with the interpreter locked, so that no Python thread can help; a timer of the operating system can.
+Fast DDS 2.14 may hang in the destruction of a participant while others leave: ``DomainParticipant::set_listener``
+waits for a mutex that is never released. rclpy calls it with the interpreter locked, so no Python thread can help. A
+timer of the operating system can.
 """
 
 from __future__ import annotations
@@ -25,11 +25,33 @@ from rclpy.node import Node
 
 from hmt_slam_ros.errors import HmtSlamError
 
-_SIGEV_THREAD = 2
-_CLOCK_MONOTONIC = 1
-# From the disappearance of another node's name until all its topics are gone as well.
-_AFTERMATH = 0.1  # s
+_SIGEV_THREAD = 2  # <signal.h>
+_CLOCK_MONOTONIC = 1  # <time.h>
+_PR_SET_PDEATHSIG = 1  # <sys/prctl.h>
+PARENT_VARIABLE = "HMT_SLAM_PARENT"
+"""Environment variable with the pid of the process that started this one, and with which it ends."""
+FAULT = 2
+"""Exit status for a fault."""
+_REALTIME_PRIORITY = 1
+"""The lowest real-time priority, so that any other real-time program comes first."""
+_GRACE_PERIOD = 8.0
+"""Time from a signal to a forced exit, s; a kernel may be compiled meanwhile."""
+_SHUTDOWN_TIMEOUT = 2.0
+"""Time for the destruction of a node, s."""
+_TOPICS_TIMEOUT = 0.1
+"""Time from the end of another node until all its topics are gone, s."""
 _SHUTDOWN_POLL = 0.01  # s
+_POLL = 0.05  # s
+# What rclpy raises where the context is gone; the last two where it finds None instead.
+_CONTEXT_LOST = (
+    NotInitializedException,
+    rclpy_implementation.InvalidHandle,
+    rclpy_implementation.RCLError,
+    AttributeError,
+    TypeError,
+)
+
+NodeType = TypeVar("NodeType", bound=Node)
 
 
 class _SignalEvent(ctypes.Structure):
@@ -57,10 +79,10 @@ class _TimerSpecification(ctypes.Structure):
 
 
 def force_exit_after(seconds: float, status: int) -> None:
-    """Let the system end this process if it is still there then; on systems other than Linux, do nothing.
+    """Let the operating system end this process after some time; only on Linux.
 
     :param seconds: from now, above 0.
-    :param status: exit status of the process in that case.
+    :param status: exit status.
     """
     if not sys.platform.startswith("linux"):
         return
@@ -77,63 +99,36 @@ def force_exit_after(seconds: float, status: int) -> None:
 
 
 def wait_until_alone(node: Node, seconds: float) -> None:
-    """Wait until nobody else is there, so that the node can be destroyed safely.
+    """Wait until all other nodes are gone, so that the node can be destroyed safely.
 
-    :param seconds: at most, for those that were killed and did not say goodbye.
+    :param seconds: most time to wait, since killed nodes stay in the graph for a while.
     """
     deadline = time.monotonic() + seconds
     while len(node.get_node_names()) > 1 and time.monotonic() < deadline:
         time.sleep(_SHUTDOWN_POLL)
-    time.sleep(_AFTERMATH)
-
-
-# The least of those of real time: any other program that asks for it comes before.
-_PRIORITY = 1
+    time.sleep(_TOPICS_TIMEOUT)
 
 
 def set_realtime_priority() -> bool:
-    """Let all threads of this process run before ordinary ones whenever they have something to do (SCHED_RR).
+    """Give all threads of this process real-time priority (SCHED_RR).
 
-    :returns: whether the system permits that, as it does to root and to those with an ``rtprio`` limit.
+    :returns: whether the system permits it, as to root and to users with an ``rtprio`` limit.
     """
     if not sys.platform.startswith("linux"):
         return False
     try:
         for thread in Path("/proc/self/task").iterdir():
-            os.sched_setscheduler(int(thread.name), os.SCHED_RR, os.sched_param(_PRIORITY))
+            os.sched_setscheduler(int(thread.name), os.SCHED_RR, os.sched_param(_REALTIME_PRIORITY))
     except PermissionError:
         return False
     return True
 
 
-# Names the process that started this one, which ends when that one does.
-PARENT_VARIABLE = "HMT_SLAM_PARENT"
-
-FAULT = 2
-_PR_SET_PDEATHSIG = 1
-# How long what is being done may take to end, such as the compilation of a kernel, before it is broken off.
-_GRACE_PERIOD = 8.0  # s
-# How long taking leave of the other nodes may take.
-_SHUTDOWN_TIMEOUT = 2.0  # s
-# Between two looks whether a node is at its end for another reason than a signal.
-_POLL = 0.05  # s
-# What calls of rclpy raise whose context is gone; the last two where they find None in its place.
-_CONTEXT_LOST = (
-    NotInitializedException,
-    rclpy_implementation.InvalidHandle,
-    rclpy_implementation.RCLError,
-    AttributeError,
-    TypeError,
-)
-
-NodeType = TypeVar("NodeType", bound=Node)
-
-
 def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None]) -> int:
-    """Make a node, spin it until SIGINT or SIGTERM, and take it down.
+    """Make a node, spin it until SIGINT or SIGTERM, and destroy it.
 
-    :param make: makes the node, and imports what takes time.
-    :param spin: returns when the node has nothing more to do.
+    :param make: makes the node.
+    :param spin: spins the node, and returns at its end.
     :returns: exit status.
     """
     stop = _SignalListener()
@@ -150,11 +145,11 @@ def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None]) -> int:
 
 
 def spin_until(node: Node, is_done: Callable[[], bool] | None = None) -> None:
-    """Spin a node until SIGINT or SIGTERM, or until it is at its end.
+    """Spin a node until SIGINT or SIGTERM, or until it is done.
 
-    By an executor of its own: ``rclpy.spin`` shares one, and fails where the signal comes before it has it.
+    The executor of ``rclpy.spin`` is shared, and missing where a signal comes early; so the node gets its own.
 
-    :param is_done: whether it is at its end, asked 20 times a second.
+    :param is_done: called 20 times a second.
     """
     if not rclpy.ok():
         return
@@ -180,13 +175,13 @@ def _run_node(
                 if rclpy.ok():
                     spin(nodes[0])
         except _CONTEXT_LOST:
-            # rclpy's own handler takes the context away at any moment, also from under a node that is being made.
+            # rclpy's signal handler may end the context at any time, also while the node is made.
             if rclpy.ok():
                 raise
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
     except HmtSlamError as error:
-        # With the error goes what is there of a node that could not be made, and with it its participant.
+        # An unfinished node is destroyed with the exception, and its participant with it.
         force_exit_after(_SHUTDOWN_TIMEOUT, FAULT)
         print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr, flush=True)
         return FAULT
@@ -194,18 +189,19 @@ def _run_node(
 
 
 class _SignalListener:
-    """Takes note of SIGINT and SIGTERM; rclpy's own handler shuts the context down, and spinning ends.
+    """Records SIGINT and SIGTERM, and forces an exit after :data:`_GRACE_PERIOD`; rclpy's handler ends the spinning.
 
-    Nothing is raised: an exception would come up at any line, also inside of a compiler, which cannot bear it. A thread
-    waits for the signal, since Python's handlers run between two lines of the main thread only: a signal that another
-    thread gets, or that comes right before a long call of C, would be taken note of after that call.
+    It raises nothing, since an exception may come up at any line, also inside a compiler. A thread waits for the
+    signal: Python runs handlers in the main thread only, and not during a long call of C.
+
+    :ivar received: whether a signal has come.
     """
 
     def __init__(self) -> None:
         self.received = False
-        self._wakeup_fd, told = os.pipe()
-        os.set_blocking(told, False)
-        signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+        self._wakeup_fd, write_fd = os.pipe()
+        os.set_blocking(write_fd, False)
+        signal.set_wakeup_fd(write_fd, warn_on_full_buffer=False)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
         threading.Thread(target=self._exit_after_signal, daemon=True).start()
@@ -219,13 +215,13 @@ class _SignalListener:
 
 
 def _ignore_signals() -> None:
-    """A second Ctrl-C does not disturb the clean-up."""
+    """Ignore further signals, such as a second Ctrl-C during the clean-up."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
 
 
 def _exit_with_parent() -> None:
-    """Where another program started this node as its helper, see to it that the node does not outlive it."""
+    """End with the parent process, where :data:`PARENT_VARIABLE` names it."""
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None or not sys.platform.startswith("linux"):
         return

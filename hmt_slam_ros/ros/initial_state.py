@@ -1,4 +1,4 @@
-"""What a node begins with: nothing, or its part of a saved map, and where in it the robot is."""
+"""Initial state of a node: none or its part of a saved map, and the initial pose in it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _START_LOST = ParameterDescriptor(
 
 
 class ConfigurationSource(Protocol):
-    """A node with parameters, as a map is compared with them."""
+    """A node whose parameters are compared with those of a map."""
 
     @property
     def configuration(self) -> Configuration:
@@ -54,19 +54,19 @@ class ConfigurationSource(Protocol):
 
 
 class InitialState:
-    """A saved map, or nothing.
+    """A saved map to start from, or nothing.
 
-    :ivar events: keyframe events in it, 0 without.
-    :ivar lost: whether nothing tells how the robot came from where it was then.
+    :ivar events: number of keyframe events in the map, 0 without.
+    :ivar lost: whether the robot may be anywhere in the map.
     :ivar folder: of the map, None without.
-    :ivar previous_scans: scans that had a pose before; those to come are numbered on, so that they are told from these.
+    :ivar previous_scans: number of scans with a pose before; new ones are numbered on from it.
     """
 
     def __init__(self, node: ConfigurationSource, path: str, *, lost: bool, previous_scans: int = 0) -> None:
-        """Check the map.
+        """Open and check the map.
 
-        :param path: its folder or the output folder around it, empty for nothing.
-        :raises HmtSlamError: where it is damaged, or the node's parameters do not go with it.
+        :param path: folder of the map or the output folder around it, empty for no map.
+        :raises HmtSlamError: where the map is damaged, or differs from the node in a fixed parameter.
         """
         self.events, self.lost, self.previous_scans = 0, lost and bool(path), previous_scans
         self._reader: FolderReader | None = None
@@ -74,29 +74,29 @@ class InitialState:
         if path:
             self.folder = map_folder(Path(path)).absolute()
             self._open(node, self.folder, FORMAT)
-            # The other processes need not be loaded for it.
             self.events = self._chain_events()
 
     @classmethod
     def from_checkpoint(cls, node: ConfigurationSource, state: Path, header: JournalHeader) -> InitialState:
-        """Where a node that was killed goes on.
+        """The state of a node that was killed.
 
-        :param state: the folder of its checkpoint.
-        :param header: what it was then.
+        :param state: folder of its checkpoint.
+        :param header: of its journal.
         :raises HmtSlamError: as for a map.
         """
-        made = cls(node, "", lost=False)
-        made._open(node, state, CHECKPOINT)
-        made.events, made.folder = header.events, Path(header.folder) if header.folder else None
-        made.map = None  # what was shown of it is part of the checkpoint
-        return made
+        initial_state = cls(node, "", lost=False)
+        initial_state._open(node, state, CHECKPOINT)
+        initial_state.events = header.events
+        initial_state.folder = Path(header.folder) if header.folder else None
+        initial_state.map = None  # the checkpoint holds what the node needs of it
+        return initial_state
 
     def _open(self, node: ConfigurationSource, folder: Path, kind: str) -> None:
         self._reader = FolderReader(folder, kind, VERSION)
         saved = load_configuration(folder / CONFIGURATION)
-        told = describe_parameter_changes(saved, replace(node.configuration, robot=saved.robot))
-        if told:
-            node.get_logger().warning(told)
+        changes = describe_parameter_changes(saved, replace(node.configuration, robot=saved.robot))
+        if changes:
+            node.get_logger().warning(changes)
 
     def _chain_events(self) -> int:
         from hmt_slam_ros.results.hmt_map import ChainState  # noqa: PLC0415
@@ -105,9 +105,9 @@ class InitialState:
         return 0 if state is None else state.events
 
     def read_part(self, name: str, kind: type[State]) -> State | None:
-        """A part of the map, None where the node begins with nothing.
+        """A part of the map, None without a map.
 
-        :raises HmtSlamError: where the map lacks it.
+        :raises HmtSlamError: where the map lacks the part.
         """
         if self._reader is None:
             return None
@@ -119,33 +119,34 @@ class InitialState:
 
     @cached_property
     def map(self) -> MapDocument | None:
-        """The map itself."""
-        from hmt_slam_ros.results.hmt_map import MapDocument  # noqa: PLC0415  for those who ask for it
+        """The map itself, None without."""
+        from hmt_slam_ros.results.hmt_map import MapDocument  # noqa: PLC0415
 
         return self.read_part("map", MapDocument)
 
 
 def declare_start_from(node: ConfiguredNode) -> str:
-    """Path of the map, empty for none."""
+    """Declare ``start_from``, and return the path of the map, empty for none."""
     return str(node.declare_parameter("start_from", "", _START_FROM).value)
 
 
-def declare_initial_state(node: ConfiguredNode) -> tuple[str, bool]:
-    """Path of the map, empty for none, and whether the robot may be anywhere in it."""
-    return declare_start_from(node), bool(node.declare_parameter("start_lost", True, _START_LOST).value)
+def declare_start_lost(node: ConfiguredNode) -> bool:
+    """Declare ``start_lost``, and return whether the robot may be anywhere in the map."""
+    return bool(node.declare_parameter("start_lost", True, _START_LOST).value)
 
 
-# Nobody knows better where a robot is, m, m, rad: some programs send zeros.
 _MIN_COVARIANCE = np.diag([0.1, 0.1, math.radians(3.0)]) ** 2
-# What RViz says of a pose that is drawn with the mouse.
+"""Added to the covariance of an initial pose, m2, m2, rad2; some programs send zeros."""
 _RVIZ_COVARIANCE = np.diag([0.5, 0.5, math.radians(15.0)]) ** 2
+"""Covariance of an initial pose that is drawn in RViz, m2, m2, rad2."""
 _GATE_DEVIATIONS = 3.0
+"""Standard deviations by which an initial pose may lie outside of the map."""
 
 
 def declare_initial_pose(node: Node) -> PoseGaussian | None:
-    """Belief over ``map_T_base`` from the parameter ``initial_pose``, None where it is not set.
+    """Declare ``initial_pose``, and return the belief over ``map_T_base``, None where it is not set.
 
-    :raises HmtSlamError: where it is set to something else than three numbers.
+    :raises HmtSlamError: for anything but three finite numbers.
     """
     descriptor = ParameterDescriptor(
         description="Pose (x, y, theta) of the robot in the map of start_from, m and rad, known to 0.5 m and 15 "
@@ -163,12 +164,12 @@ def declare_initial_pose(node: Node) -> PoseGaussian | None:
 def locate_in_map(
     process: MetricSlam, area_poses: Mapping[int, AreaPose], belief: PoseGaussian, radius: float
 ) -> InitialPose:
-    """Where a robot is in the map of the most probable hypothesis.
+    """Initial pose in an area of the most probable hypothesis.
 
     :param area_poses: ``map_T_area`` by area.
     :param belief: over ``map_T_base``.
-    :param radius: farthest distance to a keyframe of an area's place, m.
-    :raises HmtSlamError: where the map does not reach there, or the belief is none.
+    :param radius: largest distance to a keyframe of the area, m.
+    :raises HmtSlamError: where the pose is outside of the map, or the belief is invalid.
     """
     if not np.isfinite(belief.mean).all() or not np.isfinite(belief.covariance).all():
         raise HmtSlamError("the pose or its covariance is not finite: give numbers")
@@ -176,15 +177,15 @@ def locate_in_map(
     if spread[0] < -1e-9:
         raise HmtSlamError("the covariance of the pose has a negative eigenvalue: give one that is positive")
     x, y, _ = belief.mean
-    near = _nearest_area(process, area_poses, belief.mean)
-    if near is None:
+    nearest = _nearest_area(process, area_poses, belief.mean)
+    if nearest is None:
         raise HmtSlamError("there is no map yet in which the robot could be: map, or start from a map")
-    area, away = near
+    area, distance = nearest
     reach = radius + _GATE_DEVIATIONS * math.sqrt(float(np.linalg.eigvalsh(belief.covariance[:2, :2])[-1]))
-    if away > reach:
+    if distance > reach:
         raise HmtSlamError(
-            f"({x:.2f}, {y:.2f}) is outside of the map, {away:.1f} m from where the robot ever was in it: give a pose "
-            f"within {reach:.1f} m, or a larger covariance"
+            f"({x:.2f}, {y:.2f}) is outside of the map, {distance:.1f} m from where the robot ever was in it: give a "
+            f"pose within {reach:.1f} m, or a larger covariance"
         )
     pose = se2.between(area_poses[area].pose.mean, belief.mean)
     return InitialPose(area, PoseGaussian(pose, belief.covariance + _MIN_COVARIANCE))
@@ -193,19 +194,19 @@ def locate_in_map(
 def _nearest_area(
     process: MetricSlam, area_poses: Mapping[int, AreaPose], pose: NDArray[np.float64]
 ) -> tuple[int, float] | None:
-    """The area with the keyframe nearest to a pose in the map (3,), and its distance, m; None where there is none.
+    """The area with the keyframe nearest to a pose in the map (3,), and its distance, m; None without areas.
 
-    What a robot maps that may be anywhere is no part of the map.
+    What a lost robot has mapped is not part of the map.
     """
     replica = process.replica
-    hybrid_map, here = replica.maps[replica.best_hypothesis], replica.robot_areas[replica.best_hypothesis]
-    beside = connected_areas(hybrid_map, here) if process.is_lost else {}
-    away = {
+    hybrid_map, robot_area = replica.maps[replica.best_hypothesis], replica.robot_areas[replica.best_hypothesis]
+    excluded = connected_areas(hybrid_map, robot_area) if process.is_lost else {}
+    distances = {
         area: float(np.hypot(*(keyframe_positions(hybrid_map, area, area_poses[area].pose.mean) - pose[:2]).T).min())
         for area in hybrid_map.area_ids()
-        if area in area_poses and area not in beside and hybrid_map.keyframes(area)
+        if area in area_poses and area not in excluded and hybrid_map.keyframes(area)
     }
-    if not away:
+    if not distances:
         return None
-    nearest = min(away, key=lambda area: (away[area], area))
-    return nearest, away[nearest]
+    nearest = min(distances, key=lambda area: (distances[area], area))
+    return nearest, distances[nearest]

@@ -1,13 +1,12 @@
-"""A managed node of ROS 2: others may bring it up, halt it and take it down, state by state; by itself it comes up.
+"""Managed node of ROS 2: it configures and activates itself, unless a lifecycle manager does.
 
-docs/decisions/0034-managed-nodes.md says what the states mean. rclpy's part of it has three gaps that are filled here:
-an exception in a transition is passed over in silence, a transition that the state does not have ends the process, and
-nothing that was made for a state is destroyed with it.
+docs/decisions/0034-managed-nodes.md defines the states. Three gaps of rclpy are filled here. It ignores exceptions in
+a transition, ends the process at a transition that the state does not have, and destroys nothing on cleanup.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
@@ -28,24 +27,20 @@ _AUTOSTART = ParameterDescriptor(
 
 
 class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
-    """A node with parameters, diagnostics and the services of its states; what it does in them is of subclasses.
+    """A node with parameters, diagnostics and lifecycle services; subclasses define the transitions.
 
-    :ivar diagnostics: what it counts, also while it is not configured.
-    :ivar is_configured: whether it is inactive or active.
-    :ivar is_active: whether it takes part.
+    :ivar diagnostics: counts and faults, also while the node is unconfigured.
+    :ivar is_configured: whether the node is inactive or active.
+    :ivar is_active: whether the node is active.
     """
 
-    def __init__(self, name: str, changeable: Iterable[str] = ()) -> None:
-        """Declare the parameters; where one cannot be, the node is never configured.
-
-        :param name: of the node.
-        :param changeable: dotted names of the parameters that may change while the node runs.
-        """
+    def __init__(self, name: str) -> None:
+        """Declare the parameters; with an invalid one the node can never be configured."""
         self.is_configured = self.is_active = False
         self._fault: Exception | None = None
         self._parameter_fault: HmtSlamError | None = None
         try:
-            ConfiguredNode.__init__(self, name, changeable)
+            ConfiguredNode.__init__(self, name)
             self.declare_own_parameters()
         except HmtSlamError as fault:
             self._parameter_fault = fault
@@ -58,62 +53,62 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         self._update_state()
 
     def declare_own_parameters(self) -> None:
-        """Declare the parameters that are not in the tree.
+        """Declare the parameters that are not in the configuration tree.
 
-        :raises HmtSlamError: for a value that cannot be.
+        :raises HmtSlamError: for an invalid value.
         """
 
     def configure_node(self) -> None:
-        """Make all that the node needs to take part.
+        """Make the process, publishers, subscriptions, services and timers.
 
-        :raises HmtSlamError: where it cannot be; what was made by then is destroyed.
+        :raises HmtSlamError: where that fails; what was made until then is destroyed.
         """
 
     def activate_node(self) -> None:
-        """Begin, or go on after :meth:`deactivate_node`."""
+        """Start to process messages, or resume after :meth:`deactivate_node`."""
 
     def deactivate_node(self) -> None:
-        """Do nothing new, and lose nothing."""
+        """Stop to process new messages, without losing any."""
 
     def check_clean_up(self) -> None:
-        """See whether the node can be taken down and used on.
+        """Check whether the node can be cleaned up now.
 
-        :raises HmtSlamError: where that cannot be now.
+        :raises HmtSlamError: where it cannot.
         """
 
     def clean_up_node(self) -> None:
-        """Forget what :meth:`configure_node` made, but for publishers, subscriptions, services and timers."""
+        """Drop what :meth:`configure_node` made, apart from publishers, subscriptions, services and timers."""
 
     def abandon_configuration(self) -> None:
-        """Forget what :meth:`configure_node` made before it failed."""
+        """Drop what :meth:`configure_node` made before it failed."""
         self._destroy_configured_entities()
 
     def shut_down_node(self) -> None:
-        """Do what is left to do when the node is shut down, and :meth:`tear_down` at its end."""
+        """Finish what is left to do at shutdown, then :meth:`tear_down`."""
         self.tear_down()
 
     @property
     def startup_states(self) -> tuple[bool, bool]:
-        """Whether the node configures itself at its start, and activates itself."""
+        """Whether the node configures itself at startup, and whether it activates itself."""
         return self._autostart, self._autostart
 
     def enter_startup_states(self) -> None:
-        """Enter the states in which the node starts.
+        """Make the transitions of startup.
 
-        :raises HmtSlamError: where it cannot be configured.
+        :raises HmtSlamError: where one fails.
         """
         if self._parameter_fault is not None and self._autostart:
             raise self._parameter_fault
         configure, activate = (False, False) if self._parameter_fault else self.startup_states
-        for wanted, trigger in ((configure, self.trigger_configure), (activate, self.trigger_activate)):
-            if wanted:
+        for is_wanted, trigger in ((configure, self.trigger_configure), (activate, self.trigger_activate)):
+            if is_wanted:
                 trigger()
                 self._update_state()
                 if self._fault is not None:
                     raise self._fault
 
     def tear_down(self) -> None:
-        """Destroy all that was made since the node is there."""
+        """Destroy all that was made after the constructor."""
         self.clean_up_node()
         self.is_configured = self.is_active = False
         self._destroy_configured_entities()
@@ -162,7 +157,7 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         self.tear_down()
 
     def _run_transition(self, change: Callable[[], None]) -> TransitionCallbackReturn:
-        """Keep what rclpy would pass over."""
+        """Run a transition, and keep the exception, which rclpy would ignore."""
         self._fault = None
         try:
             change()
@@ -177,12 +172,12 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
     def _handle_change_state(
         self, request: ChangeState.Request, response: ChangeState.Response
     ) -> ChangeState.Response:
-        """Change the state as somebody asks; a transition that there is not is refused, and a defect ends the node."""
+        """Answer the service ``change_state``; refuse an unknown transition, and raise a programming error."""
         self._fault = None
         try:
             self._change_state(request, response)
         except rclpy_implementation.RCLError:
-            response.success = False  # rcl has told why
+            response.success = False  # rcl has logged the reason
         self._update_state()
         if isinstance(self._fault, HmtSlamError):
             self.diagnostics.fail(str(self._fault))
@@ -192,11 +187,11 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
 
     @property
     def state(self) -> str:
-        """Name of the node's state, such as unconfigured, inactive, active, finalized."""
+        """Name of the lifecycle state: unconfigured, inactive, active or finalized."""
         return str(self._state_machine.current_state[1])
 
     def destroy_node(self) -> None:
-        """As any node; the services and the publisher of the states are not the node's own for rclpy."""
+        """Destroy the node with its lifecycle services and publisher, which rclpy does not count to the node."""
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()
 
@@ -204,17 +199,17 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         self.diagnostics.values[STATE] = self.state
 
     def _entities(self) -> Iterator[Any]:
-        for there in (self.publishers, self.subscriptions, self.services, self.timers):
-            yield from there
+        for entities in (self.publishers, self.subscriptions, self.services, self.timers):
+            yield from entities
 
     def _destroy_configured_entities(self) -> None:
-        for there, destroy in (
+        for entities, destroy in (
             (self.subscriptions, self.destroy_subscription),
             (self.services, self.destroy_service),
             (self.timers, self.destroy_timer),
             (self.publishers, self.destroy_publisher),
         ):
-            for entity in set(there) - self._permanent_entities:
-                # Made by rclpy, maybe later, as use_sim_time is set.
+            for entity in set(entities) - self._permanent_entities:
+                # rclpy makes it when use_sim_time is set.
                 if getattr(entity, "topic_name", "") != CLOCK_TOPIC:
                     destroy(entity)

@@ -1,53 +1,203 @@
-"""The services of slam that save the map of all nodes, load another one, or begin anew.
+"""Services of slam that save the map of all nodes, load another one, or reset.
 
-When the parts of all processes are there, the folder takes the place of the one before.
-
-rclpy's own handler of signals takes the context away at once, and with it all talk among the nodes. So these nodes do
-without it: the one that is told goes on until the map is saved, or some seconds are over.
+A save or a reset is a coordinated request: slam waits for the end of a keyframe event, does its part and asks the other
+processes for theirs. It handles nothing until all have answered, so that all parts are of one moment.
 """
 
 from __future__ import annotations
 
 import shutil
-import signal
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import rclpy
 from nav_msgs.srv import LoadMap
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
-from rclpy.signals import uninstall_signal_handlers
 from rclpy.task import Future
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.messages.documents import ResetRequest, ResetResponse, SaveRequest, SaveResponse
-from hmt_slam_ros.ros.coordinated_request import PARTICIPANTS, RequestCoordinator
-from hmt_slam_ros.ros.execution import force_exit_after, spin_until
+from hmt_slam_ros.messages.documents import ResetRequest, ResetResponse, SaveRequest, SaveResponse, decode, encode
+from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.process_table import participant_names
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.initial_state import InitialState
 from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
-from hmt_slam_ros.ros.node_interfaces import MapServicesNode
-from hmt_slam_ros.ros.process_node import SAVE_TIMEOUT, ProcessNode
-from hmt_slam_ros.ros.topics import RESET_REQUEST, RESET_RESPONSE, SAVE_REQUEST, SAVE_RESPONSE
+from hmt_slam_ros.ros.process_node import ProcessNode
+from hmt_slam_ros.ros.topics import DOCUMENTS
 from hmt_slam_ros.saved_map.folder import HMT_MAP, MANIFEST, replace_folder
 
 if TYPE_CHECKING:
+    from hmt_slam_ros.metric_slam.slam import MetricSlam
     from hmt_slam_ros.results.hmt_map import MapWriter
 
+_REQUEST_TIMEOUT = 60.0
+"""Time for the end of a keyframe event and the responses of the others, which may compile kernels, s."""
+_DISCOVERY_TIMEOUT = 5.0
+"""Time until DDS has found processes that just started, s."""
+_UNSUBSCRIBE_TIMEOUT = 2.0
+"""Time until DDS reports that a subscription is gone, s."""
+_POLL = 0.02  # s
 _REMEDY = "the map of before stays; make room, or set save_to of slam to another folder"
+_FILE_SCHEME = "file://"
+
+
+class MapServicesNode(ProcessNode):
+    """The node ``slam``, as far as the services need it.
+
+    :ivar save_to: folder into which maps are saved.
+    :ivar map_frame: name of the map's frame.
+    :ivar estimate: the last estimate of metric SLAM, None before the first.
+    """
+
+    process: MetricSlam
+    save_to: Path
+    map_frame: str
+    estimate: LocalEstimate | None
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a map is being saved or exchanged."""
+        raise NotImplementedError
+
+    @property
+    def unchanged_map_folder(self) -> Path | None:
+        """Folder of the loaded map where the run did not change it, else None."""
+        raise NotImplementedError
+
+    def write_map(self, writer: MapWriter) -> None:
+        """Write the current map."""
+        raise NotImplementedError
+
+
+class RequestCoordinator(ABC):
+    """Slam's side of a kind of coordinated request.
+
+    :ivar is_blocking: whether slam may not handle messages.
+    """
+
+    def __init__(
+        self,
+        node: MapServicesNode,
+        on_release: Callable[[], None],
+        request_type: type[SaveRequest | ResetRequest],
+        response_type: type[SaveResponse | ResetResponse],
+        failure: str,
+    ) -> None:
+        """Make publisher, subscription and timer.
+
+        :param on_release: called when slam may handle messages again.
+        :param failure: what cannot be done, the start of each sentence about a fault.
+        """
+        self.is_blocking = False
+        self._node, self._on_release, self._response_type, self._failure = node, on_release, response_type, failure
+        self._outcome: Future | None = None
+        self._requested_at, self._number = 0.0, 0
+        self._responses: dict[str, SaveResponse | ResetResponse] = {}
+        self._request_publisher = node.create_publisher(String, DOCUMENTS[request_type], topics.CHAIN)
+        node.create_subscription(String, DOCUMENTS[response_type], self._on_response, topics.VOLATILE_CHAIN)
+        node.create_timer(PERIOD, self._check_timeout, clock=node.diagnostics.steady_clock)
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a request is under way."""
+        return self._outcome is not None
+
+    def request(self) -> Future:
+        """Start a request; its outcome is whether it succeeded, and a sentence."""
+        outcome = self._outcome = Future()
+        self._requested_at = time.monotonic()
+        self.start_if_ready()
+        return outcome
+
+    def start_if_ready(self) -> None:
+        """Start a requested operation where no keyframe event is under way and all processes are there."""
+        if self._outcome is None or self.is_blocking or self._node.process.is_awaiting_decision:
+            return
+        participants, subscribers = participant_names(), self._request_publisher.get_subscription_count()
+        if subscribers < len(participants) and time.monotonic() - self._requested_at < _DISCOVERY_TIMEOUT:
+            return
+        self._responses = {}
+        # Larger than those of a slam that was killed.
+        self._number = max(self._number + 1, time.time_ns())
+        try:
+            self.is_blocking = True
+            request = self._make_request(self._number, self._node.process.keyframe_events)
+            if subscribers < len(participants):
+                raise HmtSlamError(f"{subscribers} of {', '.join(participants)} are running: start all of them")
+        except (HmtSlamError, OSError) as fault:
+            self._end(f"{self._failure}: {fault}")
+        else:
+            self._request_publisher.publish(String(data=encode(request)))
+
+    @abstractmethod
+    def _make_request(self, number: int, events: int) -> SaveRequest | ResetRequest:
+        """Do slam's part, and make the request to the others.
+
+        :param number: of the request.
+        :param events: number of keyframe events after which it is due.
+        :raises HmtSlamError: where it cannot be done.
+        """
+
+    @abstractmethod
+    def _finish(self) -> str:
+        """Complete the request after all responses; return a sentence.
+
+        :raises HmtSlamError: where it cannot be done.
+        """
+
+    @abstractmethod
+    def _clean_up(self) -> None:
+        """Remove temporary data, whatever the outcome."""
+
+    def _on_response(self, message: String) -> None:
+        response = decode(message.data, self._response_type)
+        if not self.is_blocking or response.number != self._number:
+            return
+        self._responses[response.process] = response
+        if response.error:
+            self._end(f"{self._failure}: {response.process} says that {response.error}")
+        elif set(participant_names()) <= self._responses.keys():
+            try:
+                sentence = self._finish()
+            except HmtSlamError as fault:
+                self._end(str(fault))
+            else:
+                self._end(None, sentence)
+
+    def _check_timeout(self) -> None:
+        self.start_if_ready()
+        if self._outcome is None or time.monotonic() - self._requested_at < _REQUEST_TIMEOUT:
+            return
+        missing = [name for name in participant_names() if self.is_blocking and name not in self._responses]
+        cause = f"{' and '.join(missing)} did not answer" if missing else "a keyframe event is not answered"
+        self._end(f"{self._failure}: {cause} within {_REQUEST_TIMEOUT:g} s, look at /diagnostics")
+
+    def _end(self, fault: str | None, sentence: str = "") -> None:
+        """Set the outcome, and release slam."""
+        self._clean_up()
+        self.is_blocking = False
+        if fault is not None:
+            self._node.diagnostics.warn(fault)
+        outcome, self._outcome = self._outcome, None
+        if outcome is not None:
+            outcome.set_result((fault is None, fault or sentence))
+        self._on_release()
+
+    def _offer(self, kind: type, name: str, callback: Callable[..., Any]) -> None:
+        """Offer a service in a callback group of its own, so that the node spins while the outcome is awaited."""
+        self._node.create_service(kind, name, callback, callback_group=MutuallyExclusiveCallbackGroup())
 
 
 class _PendingSave(NamedTuple):
-    """A map that is being saved.
-
-    :ivar scratch: folder that vanishes at the end.
-    :ivar writer: of the map in it.
-    """
+    """A save under way: a temporary folder, and the writer of the map in it."""
 
     scratch: Path
     writer: MapWriter
@@ -58,27 +208,18 @@ class _PendingSave(NamedTuple):
 
 
 class MapSaver(RequestCoordinator):
-    """Answers the service ``save``."""
-
-    _node: MapServicesNode
+    """The service ``save``, and the last save at shutdown."""
 
     def __init__(self, node: MapServicesNode, on_release: Callable[[], None]) -> None:
-        """Offer the service.
-
-        :param on_release: called when slam need not wait any more.
-        """
+        """Offer the service."""
         self._target = node.save_to
-        super().__init__(
-            node, on_release, (SAVE_REQUEST, SAVE_RESPONSE), SaveResponse, f"{self._target} cannot be saved"
-        )
+        super().__init__(node, on_release, SaveRequest, SaveResponse, f"{self._target} cannot be saved")
         self._final_save: Future | None = None
         self._is_shutting_down = False
         self._pending_save: _PendingSave | None = None
-        # A group of its own, so that the node goes on while the answer is awaited.
-        group = MutuallyExclusiveCallbackGroup()
-        node.create_service(Trigger, "~/save", self._answer, callback_group=group)
+        self._offer(Trigger, "~/save", self._save)
 
-    async def _answer(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    async def _save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._node.is_busy:
             response.message = "a map is being saved or loaded already: ask again"
             return response
@@ -86,15 +227,14 @@ class MapSaver(RequestCoordinator):
         return response
 
     def poll_final_save(self) -> bool:
-        """Whether the map of a node that was told to end is saved, or cannot be; the first call asks for it."""
+        """Whether the last save has ended; the first call requests it."""
         self._is_shutting_down = True
         if self._final_save is None and not self._node.is_busy:
             self._final_save = self.request()
         return self._final_save is not None and self._final_save.done()
 
     def _make_request(self, number: int, events: int) -> SaveRequest:
-        """Write the part of slam, and ask the others for theirs."""
-        from hmt_slam_ros.results.hmt_map import MapWriter  # noqa: PLC0415  only where something is saved
+        from hmt_slam_ros.results.hmt_map import MapWriter  # noqa: PLC0415  only for a save
 
         if self._node.estimate is None:
             raise HmtSlamError("nothing is mapped yet, drive first")
@@ -113,9 +253,9 @@ class MapSaver(RequestCoordinator):
     def _finish(self) -> str:
         assert self._pending_save is not None
         try:
-            for part in self._answers.values():
-                assert isinstance(part, SaveResponse)
-                self._pending_save.writer.add_files(part.files)
+            for response in self._responses.values():
+                assert isinstance(response, SaveResponse)
+                self._pending_save.writer.add_files(response.files)
             self._pending_save.writer.finish(self._node.configuration)
             replace_folder(self._copy_unchanged_map() or self._pending_save.folder, self._target)
         except OSError as fault:
@@ -123,7 +263,7 @@ class MapSaver(RequestCoordinator):
         return f"saved to {self._target}"
 
     def _copy_unchanged_map(self) -> Path | None:
-        """A copy of the map that was loaded, where the robot was only localized in it, without what it saw since."""
+        """A copy of the loaded map where the robot was only localized in it, else None."""
         assert self._pending_save is not None
         loaded = self._node.unchanged_map_folder
         return None if loaded is None else Path(shutil.copytree(loaded, self._pending_save.scratch / "kept"))
@@ -135,34 +275,20 @@ class MapSaver(RequestCoordinator):
 
 
 def declare_save_to(node: Node) -> Path:
-    """The folder for the map, from the parameter ``save_to``."""
-    return Path(node.declare_parameter("save_to", HMT_MAP, _DESCRIPTOR).value).absolute()
-
-
-_DESCRIPTOR = ParameterDescriptor(description="Folder into which the service save writes the map.", read_only=True)
-
-
-_FILE = "file://"
+    """Declare ``save_to``, and return the folder for the map."""
+    descriptor = ParameterDescriptor(description="Folder into which the service save writes the map.", read_only=True)
+    return Path(node.declare_parameter("save_to", HMT_MAP, descriptor).value).absolute()
 
 
 class MapLoader(RequestCoordinator):
-    """Answers the services ``load_map`` and ``reset``."""
-
-    _node: MapServicesNode
+    """The services ``load_map`` and ``reset``."""
 
     def __init__(self, node: MapServicesNode, on_release: Callable[[], None]) -> None:
-        """Offer the services.
-
-        :param on_release: called when slam need not wait any more.
-        """
-        super().__init__(
-            node, on_release, (RESET_REQUEST, RESET_RESPONSE), ResetResponse, "the map cannot be exchanged"
-        )
+        """Offer the services."""
+        super().__init__(node, on_release, ResetRequest, ResetResponse, "the map cannot be exchanged")
         self._folder = ""
-        # A group of its own, so that the node goes on while the answer is awaited.
-        group = MutuallyExclusiveCallbackGroup()
-        node.create_service(LoadMap, "~/load_map", self._load, callback_group=group)
-        node.create_service(Trigger, "~/reset", self._reset, callback_group=group)
+        self._offer(LoadMap, "~/load_map", self._load)
+        self._offer(Trigger, "~/reset", self._reset)
 
     async def _reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._node.is_busy:
@@ -175,18 +301,18 @@ class MapLoader(RequestCoordinator):
         return response
 
     async def _load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
-        """As the result code of nav2's map_server, which has no sentence; that is in the log and in /diagnostics."""
+        """Answer as nav2's map_server does, by a result code; the sentence is in the log and in /diagnostics."""
         response.result = LoadMap.Response.RESULT_UNDEFINED_FAILURE
         if self._node.is_busy:
             self._node.diagnostics.warn("a map is being saved or loaded, so no other one is loaded: ask again")
             return response
-        folder = Path(request.map_url.removeprefix(_FILE)).absolute()
+        folder = Path(request.map_url.removeprefix(_FILE_SCHEME)).absolute()
         if not folder.is_dir():
             self._node.diagnostics.warn(f"there is no folder {folder}: set map_url to an output folder or hmt_map")
             response.result = LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
             return response
         try:
-            known = self._read_checked_map(folder).map
+            document = self._read_checked_map(folder).map
         except HmtSlamError as fault:
             self._node.diagnostics.warn(f"{folder} is not loaded: {fault}")
             response.result = LoadMap.Response.RESULT_INVALID_MAP_DATA
@@ -195,18 +321,19 @@ class MapLoader(RequestCoordinator):
         done, _ = await self.request()
         if done:
             response.result = LoadMap.Response.RESULT_SUCCESS
-            view = MapRenderer(self._node.configuration, self._node.map_frame, MapRendererState.from_document(known))
-            response.map = view.occupancy_grid() or response.map
+            state = MapRendererState.from_document(document)
+            renderer = MapRenderer(self._node.configuration, self._node.map_frame, state)
+            response.map = renderer.occupancy_grid() or response.map
         return response
 
     def _read_checked_map(self, folder: Path) -> InitialState:
-        """A map of which all parts can be read, so that either all processes begin with it or none does."""
-        from hmt_slam_ros.results.hmt_map import PARTS as KINDS  # noqa: PLC0415  only where something is loaded
+        """A map whose parts can all be read, so that either all processes start with it or none does."""
+        from hmt_slam_ros.results.hmt_map import PARTS  # noqa: PLC0415  only for a load
 
-        beginning = InitialState(self._node, str(folder), lost=True)
-        for name in PARTICIPANTS:
-            beginning.read_part(name, KINDS[name])
-        return beginning
+        initial_state = InitialState(self._node, str(folder), lost=True)
+        for name in participant_names():
+            initial_state.read_part(name, PARTS[name])
+        return initial_state
 
     def _make_request(self, number: int, events: int) -> ResetRequest:
         return ResetRequest(number, events, self._folder)
@@ -219,84 +346,36 @@ class MapLoader(RequestCoordinator):
         self._folder = ""
 
 
-def spin(node: ProcessNode) -> None:
-    """Begin and spin a node until it is told to end and its part of the last map is saved, if one is to be.
-
-    :raises HmtSlamError: where it cannot begin.
-    """
-    node.enter_startup_states()
-    ended = False
-    try:
-        _spin(node)
-        ended = True
-    finally:
-        if ended or not rclpy.ok():
-            node.discard_recovery()
-
-
-def _spin(node: ProcessNode) -> None:
-    if not node.save_on_shutdown or not rclpy.ok():
-        spin_until(node)
-        return
-    told = _FirstSignal()
-    spin_until(node, lambda: told.has_timed_out or (told.received_at is not None and node.poll_final_save()))
-
-
-class _FirstSignal:
-    """Takes note of the first signal in place of rclpy's handler; more of them change nothing.
-
-    :ivar received_at: when that was, by the monotonic clock, None before.
-    """
-
-    def __init__(self) -> None:
-        self.received_at: float | None = None
-        uninstall_signal_handlers()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self)
-
-    @property
-    def has_timed_out(self) -> bool:
-        """Whether there is no time left."""
-        return self.received_at is not None and time.monotonic() - self.received_at > SAVE_TIMEOUT
-
-    def __call__(self, _number: int, _frame: object) -> None:
-        if self.received_at is None:
-            self.received_at = time.monotonic()
-            force_exit_after(SAVE_TIMEOUT + 1.0, 0)
-
-
-# Until DDS tells that a subscription is gone.
-_UNSUBSCRIBE_TIMEOUT = 2.0  # s
-_POLL = 0.02  # s
-
-
 class StaleSubscribers:
-    """Those that are asked for their part of a map; a node that is configured anew is another one."""
+    """Subscribers to save requests that still have a map that slam gave up.
+
+    A node that is configured again has a new subscription, which is not stale.
+    """
 
     def __init__(self, node: Node) -> None:
-        """Nothing was given up yet."""
         self._node = node
         self._stale: set[bytes] = set()
 
     def mark_current(self) -> None:
-        """All that there are now have a map that is given up."""
+        """Mark all current subscribers as stale."""
         self._stale = set(self._current_subscribers())
 
     def check_gone(self) -> None:
-        """See whether a map can begin.
+        """Check that no stale subscriber is left, so that slam can start a map.
 
-        :raises HmtSlamError: where others have what was given up.
+        :raises HmtSlamError: where one is left.
         """
         deadline = time.monotonic() + _UNSUBSCRIBE_TIMEOUT
-        while left := self._stale & self._current_subscribers().keys():
+        while stale := self._stale & self._current_subscribers().keys():
             if time.monotonic() > deadline:
-                names = sorted(self._current_subscribers()[one] for one in left)
+                names = sorted(self._current_subscribers()[gid] for gid in stale)
                 raise HmtSlamError(
                     f"{', '.join(names)} still have the map that slam gave up: clean these up too, then configure slam"
                 )
             time.sleep(_POLL)
 
     def _current_subscribers(self) -> dict[bytes, str]:
-        """{identity of a subscription: name of its node}."""
-        there = self._node.get_subscriptions_info_by_topic(self._node.resolve_topic_name(SAVE_REQUEST))
-        return {bytes(one.endpoint_gid): one.node_name for one in there}
+        """{gid of a subscription: name of its node}."""
+        topic = self._node.resolve_topic_name(DOCUMENTS[SaveRequest])
+        endpoints = self._node.get_subscriptions_info_by_topic(topic)
+        return {bytes(endpoint.endpoint_gid): endpoint.node_name for endpoint in endpoints}

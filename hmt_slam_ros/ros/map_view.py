@@ -1,4 +1,4 @@
-"""The map for people and other programs to see: an occupancy grid, and areas and arcs as markers."""
+"""Rendering of the map: an occupancy grid, and areas and arcs as markers."""
 
 from __future__ import annotations
 
@@ -31,13 +31,14 @@ _ROBOT_AREA = ColorRGBA(r=0.84, g=0.15, b=0.16, a=0.9)
 _ARC = ColorRGBA(r=0.3, g=0.3, b=0.3, a=0.9)
 _CLOSURE = ColorRGBA(r=1.0, g=0.5, b=0.05, a=0.9)
 _TEXT = ColorRGBA(a=1.0)
-_ELLIPSE_OPACITY = 0.3  # opacity of ellipses
-_MIN_SIZE = 1e-3  # m, since RViz complains of what has no size
+_ELLIPSE_OPACITY = 0.3
+_MIN_SIZE = 1e-3
+"""Smallest size of a marker, m; RViz refuses zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapRendererState:
-    """What there is to be drawn.
+    """State of a renderer.
 
     :ivar stamp: of the newest keyframe, ns, 0 before the first.
     :ivar replica: the maps of the live hypotheses.
@@ -50,19 +51,22 @@ class MapRendererState:
 
     @classmethod
     def from_document(cls, document: MapDocument | None) -> MapRendererState:
-        """Of a saved map, or of nothing."""
+        """The state for a saved map, or for none."""
         return cls() if document is None else cls(document.last_estimate.stamp, document.replica, document.area_poses)
 
 
 class MapRenderer:
-    """Follows the chain, and draws the most probable hypothesis.
+    """Renders the most probable hypothesis from the messages of the chain.
 
     :ivar stamp: of the newest keyframe, ns.
     :ivar version: number of changes so far.
     """
 
     def __init__(self, configuration: Configuration, frame: str, state: MapRendererState) -> None:
-        """:param state: what to begin with."""
+        """Start with a state.
+
+        :param frame: name of the map's frame.
+        """
         self.stamp = state.stamp
         self.version = 1 if state.area_poses else 0
         self._settings, self._frame = configuration.local_map, frame
@@ -71,7 +75,7 @@ class MapRenderer:
 
     @property
     def state(self) -> MapRendererState:
-        """All that is drawn, as a value."""
+        """The state of the renderer."""
         poses = tuple(AreaPose(area, pose) for area, pose in self._area_poses.items())
         return MapRendererState(self.stamp, self._replica.state, poses)
 
@@ -83,50 +87,48 @@ class MapRenderer:
             self.stamp = message.scan.stamp
         elif isinstance(message, ClosureDecision):
             if message.global_poses:
-                self._area_poses = {area.area: area.pose for area in message.global_poses}
+                self._area_poses = {entry.area: entry.pose for entry in message.global_poses}
             self.version += 1
 
     def _area_ids(self) -> list[int]:
-        return [
-            area for area in self._replica.maps[self._replica.best_hypothesis].area_ids() if area in self._area_poses
-        ]
+        hybrid_map = self._replica.maps[self._replica.best_hypothesis]
+        return [area for area in hybrid_map.area_ids() if area in self._area_poses]
 
     def occupancy_grid(self) -> OccupancyGrid | None:
-        """The occupancy grid, None while there is no keyframe."""
-        from hmt_slam_ros.grids.occupancy_map import occupancy_image  # noqa: PLC0415  only where someone looks
+        """The occupancy grid, None before the first keyframe."""
+        from hmt_slam_ros.grids.occupancy_map import occupancy_image  # noqa: PLC0415  only for subscribers
 
-        best = self._replica.maps[self._replica.best_hypothesis]
-        placed = {
+        hybrid_map = self._replica.maps[self._replica.best_hypothesis]
+        keyframe_poses = {
             keyframe: se2.compose(self._area_poses[area].mean, pose)
             for area in self._area_ids()
-            for keyframe, pose in best.keyframes(area).items()
+            for keyframe, pose in hybrid_map.keyframes(area).items()
         }
-        if not placed:
+        if not keyframe_poses:
             return None
-        scans = [self._replica.scans[keyframe] for keyframe in placed]
-        poses = np.array(list(placed.values()))
+        scans = [self._replica.scans[keyframe] for keyframe in keyframe_poses]
+        poses = np.array(list(keyframe_poses.values()))
         image = occupancy_image(scans, poses, self._settings.cell, self._settings.max_range)
         return grid_message(self.stamp, self._frame, image)
 
     def graph_markers(self) -> MarkerArray:
-        """Areas as labeled discs, arcs as lines, both with 95 % ellipses.
+        """Areas as labeled discs, arcs as lines, both with 95 % ellipses and texts.
 
-        The robot's area and the arcs that closed a loop stand out. An arc's ellipse, in its middle, is that of one
-        area seen from the other; an area's, around it, that of its place in the map. Its text says it in words. There
-        is none where that could be any.
+        The robot's area and loop closures have colors of their own. An area's ellipse is that of its position in the
+        map; an arc's, in its middle, is that of one area in the other. An uninformative pose has no ellipse.
         """
-        best, areas = self._replica.maps[self._replica.best_hypothesis], self._area_ids()
-        here = self._replica.robot_areas[self._replica.best_hypothesis]
+        hybrid_map = self._replica.maps[self._replica.best_hypothesis]
+        robot_area = self._replica.robot_areas[self._replica.best_hypothesis]
         markers = [Marker(action=Marker.DELETEALL)]
-        for area in areas:
-            belief, color = self._area_poses[area], _ROBOT_AREA if area == here else _AREA
+        for area in self._area_ids():
+            belief, color = self._area_poses[area], _ROBOT_AREA if area == robot_area else _AREA
             disc = self._marker("areas", area, Marker.CYLINDER, (0.6, 0.6, 0.1), color)
             label = self._marker("labels", area, Marker.TEXT_VIEW_FACING, (0.0, 0.0, 0.5), _TEXT)
             at = disc.pose.position = _point_message(belief.mean)
             label.pose.position, label.text = Point(x=at.x, y=at.y, z=0.6), str(area)
             text = f"Area {area} in the map: {_deviation_text(belief)}"
             markers += [disc, label, *self._ellipse_markers("area_uncertainty", area, belief, at, color, text)]
-        for number, (a, b, arc) in enumerate(best.all_arcs()):
+        for number, (a, b, arc) in enumerate(hybrid_map.all_arcs()):
             if a in self._area_poses and b in self._area_poses:
                 color, group = (_CLOSURE, "closures") if arc.closure else (_ARC, "arcs")
                 line = self._marker(group, number, Marker.LINE_STRIP, (0.08, 0.0, 0.0), color)
@@ -134,16 +136,16 @@ class MapRenderer:
                     _point_message(self._area_poses[a].mean),
                     _point_message(self._area_poses[b].mean),
                 ]
-                seen = PoseGaussian.from_pose(self._area_poses[a].mean).compose(arc.pose)
+                belief = PoseGaussian.from_pose(self._area_poses[a].mean).compose(arc.pose)
                 middle = Point(x=0.5 * (start.x + end.x), y=0.5 * (start.y + end.y))
                 text = f"Area {b} seen from {a}: {_deviation_text(arc.pose)}{', closed a loop' * arc.closure}"
-                markers += [line, *self._ellipse_markers("arc_uncertainty", number, seen, middle, color, text)]
+                markers += [line, *self._ellipse_markers("arc_uncertainty", number, belief, middle, color, text)]
         return MarkerArray(markers=markers)
 
     def _ellipse_markers(
         self, group: str, number: int, belief: PoseGaussian, at: Point, color: ColorRGBA, text: str
     ) -> list[Marker]:
-        """The ellipse; none where it would only hide the map."""
+        """The 95 % ellipse of a pose, none for an uninformative one, which would hide the map."""
         if is_uninformative(belief):
             return []
         ellipse = belief.position_ellipse()
@@ -161,7 +163,7 @@ class MapRenderer:
 
 
 def grid_message(stamp: int, frame: str, image: Any) -> OccupancyGrid:  # noqa: ANN401  an OccupancyImage, see grid()
-    """ROS's occupancy grid: row 0 is the smallest y, 100 occupied, 0 free, -1 unknown."""
+    """ROS occupancy grid of an image: row 0 has the smallest y; 100 is occupied, 0 free, -1 unknown."""
     from hmt_slam_ros.grids.occupancy_map import FREE, OCCUPIED  # noqa: PLC0415
 
     pixels = image.pixels[::-1]
@@ -177,9 +179,9 @@ def grid_message(stamp: int, frame: str, image: Any) -> OccupancyGrid:  # noqa: 
 
 
 def _deviation_text(belief: PoseGaussian) -> str:
-    """Standard deviations of a pose, that of the position where it is largest."""
-    turn = math.degrees(math.sqrt(belief.covariance[2, 2]))
-    return f"±{belief.position_ellipse().semi_major / ELLIPSE_95:.2f} m, ±{turn:.1f}°"
+    """Standard deviations of a pose: the largest of its position, and that of its heading."""
+    heading_deviation = math.degrees(math.sqrt(belief.covariance[2, 2]))
+    return f"±{belief.position_ellipse().semi_major / ELLIPSE_95:.2f} m, ±{heading_deviation:.1f}°"
 
 
 def _point_message(pose: NDArray[np.float64]) -> Point:

@@ -14,10 +14,9 @@ from rclpy.parameter import Parameter
 from hmt_slam_ros.configuration import Configuration, FlatParameter, flat_parameters, with_changes
 from hmt_slam_ros.errors import HmtSlamError
 
-# Names that are not in the tree but in a node's parameters all the same.
-_FRAMES = ("base_frame", "odom_frame", "map_frame", "laser_frame", "laser_pose")
+# Parameters of nodes that the configuration tree does not have.
 _NODE_PARAMETERS = (
-    *_FRAMES,
+    *("base_frame", "odom_frame", "map_frame", "laser_frame", "laser_pose"),
     "log",
     "save_to",
     "save_on_shutdown",
@@ -31,46 +30,45 @@ _ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overri
 
 
 class ConfiguredNode(Node):
-    """A node that has every parameter of the tree as a ROS parameter.
+    """A node that has every parameter of the configuration tree as a ROS parameter.
 
-    :ivar configuration: the tree with the values of now.
+    :cvar changeable_parameters: dotted names of the parameters that may change while the node runs.
+    :ivar configuration: the tree with the current values.
     """
 
-    def __init__(self, name: str, changeable: Iterable[str] = (), **options: Any) -> None:  # noqa: ANN401  Node's own
-        """Declare the parameters with the values that the node is started with, and watch over later changes.
+    changeable_parameters: tuple[str, ...] = ()
 
-        :param name: of the node.
-        :param changeable: dotted names of the parameters that may change while the node runs.
-        :raises HmtSlamError: for a value that cannot be, or a name that there is not, which ROS would pass over.
+    def __init__(self, name: str, **options: Any) -> None:  # noqa: ANN401  Node's own
+        """Declare the parameters with their overrides, and check later changes.
+
+        :raises HmtSlamError: for an invalid value, or an unknown name, which ROS would ignore.
         """
         super().__init__(name, **options)
-        self._changeable = frozenset(changeable)
-        # rclpy has no public way to list what the node is started with.
+        # rclpy has no public list of the overrides.
         self.configuration = _with_values(Configuration(), self._parameter_overrides.values())
-        for leaf in flat_parameters(self.configuration):
-            self.declare_parameter(leaf.name, leaf.default, _descriptor(leaf))
+        for parameter in flat_parameters(self.configuration):
+            self.declare_parameter(parameter.name, parameter.default, _descriptor(parameter))
         self.add_on_set_parameters_callback(self._check_changes)
         self.add_post_set_parameters_callback(self._apply_changes)
 
     def on_configuration_changed(self, configuration: Configuration) -> None:
-        """Take note of new values of the parameters that may change."""
+        """Apply new values of the changeable parameters."""
         self.configuration = configuration
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters, as the services do.
 
-        rclpy looks at types and ranges before it asks the callbacks, and refuses without advice: ours is asked first.
+        rclpy checks types and ranges before the callbacks, without advice to the user. So the check here comes first.
         """
         result = self._check_changes(parameter_list)
         return super().set_parameters_atomically(parameter_list) if result.successful else result
 
     def _check_changes(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Whether all of the changes are possible."""
         try:
             _with_values(self.configuration, parameters)
         except HmtSlamError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        fixed = sorted(_tree_values(parameters).keys() - self._changeable)
+        fixed = sorted(_tree_values(parameters).keys() - set(self.changeable_parameters))
         if fixed:
             reason = f"{fixed[0]} is fixed while the node runs: set it in the parameter file and restart"
             return SetParametersResult(successful=False, reason=reason)
@@ -82,7 +80,7 @@ class ConfiguredNode(Node):
 
 
 def _tree_values(parameters: Iterable[Parameter]) -> dict[str, Any]:
-    """Name -> value of those that the tree has, or that nobody has."""
+    """{name: value} of the parameters in the tree, and of unknown ones."""
     return {
         parameter.name: parameter.value
         for parameter in parameters
@@ -91,42 +89,40 @@ def _tree_values(parameters: Iterable[Parameter]) -> dict[str, Any]:
 
 
 def _with_values(configuration: Configuration, parameters: Iterable[Parameter]) -> Configuration:
-    """The configuration with new values, which have to be of the type that ROS wants too."""
+    """The configuration with new values, which must also have the type that ROS wants."""
     changes = _tree_values(parameters)
     changed = with_changes(configuration, changes)
-    for leaf in flat_parameters(changed):
-        if leaf.kind is float and type(changes.get(leaf.name)) is int:
-            raise HmtSlamError(
-                f"{leaf.name} = {changes[leaf.name]} has the wrong type for ROS: write {float(leaf.value)!r}"
-            )
+    for parameter in flat_parameters(changed):
+        name = parameter.name
+        if parameter.kind is float and type(changes.get(name)) is int:
+            raise HmtSlamError(f"{name} = {changes[name]} has the wrong type for ROS: write {float(parameter.value)!r}")
     return changed
 
 
-def _descriptor(leaf: FlatParameter) -> ParameterDescriptor:
+def _descriptor(parameter: FlatParameter) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
-        description=f"{leaf.description} {leaf.unit}".strip(),
-        additional_constraints=f"one of {', '.join(leaf.choices)}" if leaf.choices else "",
+        description=f"{parameter.description} {parameter.unit}".strip(),
+        additional_constraints=f"one of {', '.join(parameter.choices)}" if parameter.choices else "",
     )
-    if leaf.low is not None and leaf.high is not None:
-        if leaf.kind is int:
-            descriptor.integer_range = [IntegerRange(from_value=int(leaf.low), to_value=int(leaf.high))]
+    low, high = parameter.low, parameter.high
+    if low is not None and high is not None:
+        if parameter.kind is int:
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
         else:
-            descriptor.floating_point_range = [
-                FloatingPointRange(from_value=float(leaf.low), to_value=float(leaf.high))
-            ]
+            descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
     return descriptor
 
 
 def declare_frame(node: Node, which: str, default: str) -> str:
-    """The name of a frame, from the parameter ``<which>_frame``."""
+    """Declare the parameter ``<which>_frame``, and return the name of the frame."""
     descriptor = ParameterDescriptor(description=f"Name of the {which} frame.", read_only=True)
     return str(node.declare_parameter(f"{which}_frame", default, descriptor).value)
 
 
 def declare_laser_pose(node: Node) -> NDArray[np.float64] | None:
-    """``base_T_laser`` (3,) from the parameter ``laser_pose``, None where it is not set.
+    """Declare ``laser_pose``, and return ``base_T_laser`` (3,), None where it is not set.
 
-    :raises HmtSlamError: where it is set to something else than three numbers.
+    :raises HmtSlamError: for anything but three finite numbers.
     """
     descriptor = ParameterDescriptor(
         description="Pose (x, y, theta) of the laser on the robot in m and rad; where it is not set, /tf_static tells.",

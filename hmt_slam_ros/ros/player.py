@@ -1,4 +1,4 @@
-"""When each record of a log is due: rate, pause, loop, and the pace at which scans are acknowledged."""
+"""Player of a log: when each measurement is due, by rate, pause, loop and flow control."""
 
 from __future__ import annotations
 
@@ -8,30 +8,29 @@ from dataclasses import replace
 
 from hmt_slam_ros.configuration.robot import RobotParameters
 from hmt_slam_ros.logs import Log
+from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.sensors import Odometry, Scan
 
-_SECOND = 1_000_000_000
-# Between the last record of one pass and the first of the next.
-_LOOP_GAP = 100_000_000  # ns
-# A player that is later than this does not catch up in a burst, but goes on from where it is.
-_MAX_LAG = 0.1  # s
+_LOOP_GAP = 100_000_000
+"""Time between the last record of one pass and the first of the next, ns."""
+_MAX_LAG = 0.1
+"""Delay above which the player does not catch up by a burst, but plays on from where it is, s."""
 
 
 class Player:
-    """Hands out the measurements of a log when they are due; the time is told to it.
+    """Gives the measurements of a log when they are due; the caller has the clock.
 
-    :ivar settings: rate, pace and so on; may be exchanged while playing.
+    :ivar settings: rate and flow control; may be replaced while playing.
     :ivar is_paused: whether nothing is due.
-    :ivar scans_sent: scans handed out.
-    :ivar readings_sent: odometry readings handed out.
-    :ivar stamp: of the last measurement handed out, ns.
-    :ivar has_ended: whether the last measurement has been handed out.
+    :ivar scans_sent: number of scans so far.
+    :ivar readings_sent: number of odometry readings so far.
+    :ivar stamp: of the last measurement, ns.
+    :ivar has_ended: whether the last measurement was given.
     """
 
     def __init__(self, log: Log, settings: RobotParameters) -> None:
         self.settings = settings
         self.is_paused = False
-        self.has_ended = False
         self.scans_sent, self.readings_sent, self.stamp = 0, 0, 0
         self._records = _measurements(log, settings)
         self._next_measurement: Scan | Odometry | None = next(self._records, None)
@@ -41,11 +40,11 @@ class Player:
 
     @property
     def scans_acknowledged(self) -> int:
-        """Scans of which nothing more is awaited."""
+        """Number of acknowledged scans."""
         return self.scans_sent - len(self._unacknowledged)
 
     def acknowledge(self, stamp: int) -> None:
-        """The scan of ``stamp`` (ns), and with it every earlier one, has been worked off."""
+        """Acknowledge the scan of ``stamp`` (ns) and all earlier ones."""
         while self._unacknowledged and self._unacknowledged[0] <= stamp:
             self._unacknowledged.popleft()
 
@@ -59,9 +58,9 @@ class Player:
         )
 
     def seconds_until_due(self, now: float) -> float | None:
-        """Seconds until the next measurement is due, 0 where it is due now, None where it is not known.
+        """Time until the next measurement is due, s, 0 where it is due now, None where that is unknown.
 
-        :param now: seconds of a clock that runs evenly.
+        :param now: time of a monotonic clock, s.
         """
         if self._next_measurement is None or self.is_paused or self.is_held_up:
             return None
@@ -70,27 +69,27 @@ class Player:
     def take_next(self, now: float) -> Scan | Odometry:
         """The next measurement."""
         assert self._next_measurement is not None
-        taken, due = self._next_measurement, self._due_time(now)
+        measurement, due = self._next_measurement, self._due_time(now)
         self._last_due_time = due if now - due < _MAX_LAG else now
-        self.stamp = taken.stamp
-        if isinstance(taken, Scan):
+        self.stamp = measurement.stamp
+        if isinstance(measurement, Scan):
             self.scans_sent += 1
-            self._unacknowledged.append(taken.stamp)
+            self._unacknowledged.append(measurement.stamp)
         else:
             self.readings_sent += 1
         self._next_measurement = next(self._records, None)
         self.has_ended = self._next_measurement is None
-        return taken
+        return measurement
 
     def _due_time(self, now: float) -> float:
         assert self._next_measurement is not None
         if self._last_due_time is None or self.settings.rate == 0.0:
             return now
-        return self._last_due_time + (self._next_measurement.stamp - self.stamp) / _SECOND / self.settings.rate
+        return self._last_due_time + (self._next_measurement.stamp - self.stamp) / NANOSECONDS / self.settings.rate
 
 
 def _measurements(log: Log, settings: RobotParameters) -> Iterator[Scan | Odometry]:
-    """Measurements of the log, over and over where it loops, with stamps that go on increasing."""
+    """Measurements of the log, repeated where it loops, with increasing stamps."""
     shift = last = 0
     while True:
         first = None

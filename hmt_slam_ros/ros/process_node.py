@@ -1,26 +1,34 @@
-"""The shell that all process nodes share: convert, call the process once, publish."""
+"""Node of a process: convert inputs, call the process once, publish outputs; with saves, resets and recovery."""
 
 from __future__ import annotations
 
 import json
+import signal
 import time
-from collections.abc import Iterable, Mapping
+from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.parameter import Parameter
+from rclpy.signals import uninstall_signal_handlers
+from std_msgs.msg import String
 
 from hmt_slam_ros.compilation import report_compilation
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import as_flat
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.messages.documents import ResetRequest, ResetResponse, SaveRequest, SaveResponse, encode
 from hmt_slam_ros.messages.messages import Message, Notice, RealTimePose, TrackingReset
 from hmt_slam_ros.messages.routing import SUBSCRIPTIONS, Checkpointable, message_types
-from hmt_slam_ros.process_table import process_row
-from hmt_slam_ros.ros.coordinated_request import PARTICIPANTS, RequestParticipant
-from hmt_slam_ros.ros.inbox import Inbox
-from hmt_slam_ros.ros.initial_state import InitialState, declare_initial_state
+from hmt_slam_ros.process_table import participant_names, process_row
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.execution import force_exit_after, spin_until
+from hmt_slam_ros.ros.initial_state import InitialState, declare_start_from, declare_start_lost
 from hmt_slam_ros.ros.lifecycle import ManagedNode
-from hmt_slam_ros.ros.outbox import Outbox
+from hmt_slam_ros.ros.message_io import CHAIN, Inbox, Outbox, subscribe_document
 from hmt_slam_ros.ros.recovery import (
     ActivationChange,
     ControlEvent,
@@ -30,12 +38,13 @@ from hmt_slam_ros.ros.recovery import (
     Recovery,
     declare_recovery,
 )
+from hmt_slam_ros.ros.topics import DOCUMENTS
+from hmt_slam_ros.saved_map.folder import FileRecord, FolderWriter
 
 SAVE_TIMEOUT = 8.0
-"""Seconds for the last map: a launch tells its nodes to end once more after 5 s, and kills them after 10 s."""
-
-# What a node said last has to reach the others before it takes leave.
-_LINGER = 0.5  # s
+"""Time for the last save, s: launch sends SIGTERM 5 s after SIGINT, and SIGKILL 5 s later."""
+_LINGER = 0.5
+"""Time from a node's part of the last save to its end, s, in which DDS delivers the response."""
 _POLL = 0.05  # s
 _SAVE_ON_SHUTDOWN = ParameterDescriptor(
     description="Whether all nodes save the map to save_to of slam when they are told to end.", read_only=True
@@ -43,81 +52,100 @@ _SAVE_ON_SHUTDOWN = ParameterDescriptor(
 
 
 class ProcessNode(ManagedNode):
-    """A process of :mod:`hmt_slam_ros.messages` as a node of the same name.
+    """Node of a process of the process table, with the same name.
 
-    :ivar is_always_listening: whether the process hears all the same while the node is inactive, and says what it has
-        to.
-    :ivar save_on_shutdown: whether it stays for that when it is told to end.
+    :cvar is_always_listening: whether the process also gets messages while the node is inactive.
+    :ivar save_on_shutdown: whether the map is saved before the node ends.
+    :ivar process: the process, from :meth:`configure_node` on.
+    :ivar reset_number: number of the last reset request that was answered, 0 before the first.
+    :ivar is_recovering: whether the node handles inputs from the journal of a killed node.
     """
 
     is_always_listening = False
     save_on_shutdown = False
 
-    def __init__(
-        self,
-        name: str,
-        changeable: Iterable[str] = (),
-    ) -> None:
-        """Declare the parameters.
-
-        :param name: of a process in the process table.
-        :param changeable: parameters that may change while the node runs.
-        """
+    def __init__(self, name: str) -> None:
+        """Declare the parameters, and read what a killed node of the same name left."""
         self._name, self._output_types = name, (*message_types(process_row(name).produces), Notice)
-        super().__init__(name, changeable)
+        super().__init__(name)
 
     def declare_own_parameters(self) -> None:
-        """Declare those of all processes, and look for what a node of the same name left behind.
+        """Declare the parameters of all processes.
 
-        :raises HmtSlamError: where that is damaged.
+        :raises HmtSlamError: where a journal is damaged.
         """
         self.save_on_shutdown = bool(self.declare_parameter("save_on_shutdown", False, _SAVE_ON_SHUTDOWN).value)
-        self.start_from, self._start_lost = declare_initial_state(self)
+        self.start_from, self._start_lost = declare_start_from(self), declare_start_lost(self)
         self._recovery_folder = declare_recovery(self)
         self.recovery = Recovery(self, self._recovery_folder)
 
+    def spin(self) -> None:
+        """Run until the node is to end, and its part of the last map is saved where that is wanted.
+
+        With ``save_on_shutdown`` rclpy's signal handlers are replaced, as they would end all communication at once.
+
+        :raises HmtSlamError: where the node cannot start.
+        """
+        self.enter_startup_states()
+        has_ended = False
+        try:
+            if self.save_on_shutdown and rclpy.ok():
+                first_signal = _FirstSignal()
+                spin_until(
+                    self,
+                    lambda: (
+                        first_signal.has_timed_out or (first_signal.received_at is not None and self.poll_final_save())
+                    ),
+                )
+            else:
+                spin_until(self)
+            has_ended = True
+        finally:
+            if has_ended or not rclpy.ok():
+                self.discard_recovery()
+
     @property
     def startup_states(self) -> tuple[bool, bool]:
-        """Those in which a node of the same name was when it was killed, if one was."""
-        found, (configure, activate) = self.recovery.recovered_state, super().startup_states
-        if found is None:
+        """As any managed node; after a kill those of the killed node."""
+        recovered, (configure, activate) = self.recovery.recovered_state, super().startup_states
+        if recovered is None:
             return configure, activate
-        return True, activate if found.was_active is None else found.was_active
+        return True, activate if recovered.was_active is None else recovered.was_active
 
     def configure_node(self) -> None:
-        """Make the process with what it begins with or what was left behind, and all that it hears and says.
+        """Make the process, inbox and outbox.
 
-        :raises HmtSlamError: for a map that cannot be.
+        :raises HmtSlamError: for a map or journal that is damaged or does not match.
         """
-        found = self.recovery.recovered_state
-        self._reset_number, self._checkpoint_count, self._is_recovering = 0, 0, found is not None
-        if found is None:
+        recovered = self.recovery.recovered_state
+        self.reset_number, self._checkpoint_count, self.is_recovering = 0, 0, recovered is not None
+        if recovered is None:
             self.initial_state = InitialState(self, self.start_from, lost=self._start_lost)
         else:
-            self.initial_state = self._recovered_initial_state(found)
+            self.initial_state = self._recovered_initial_state(recovered)
         self.process = self._create_process()
-        if found is None:
-            self.recovery.start_journal(self._journal_header())
+        if recovered is None:
+            self._start_journal()
         report_compilation(self.get_logger().info)
-        self.outbox = Outbox(self, self._output_types, self._reset_number)
+        self.outbox = Outbox(self, self._output_types, self.reset_number)
         self.inbox = Inbox(
             self,
             SUBSCRIPTIONS[self._name],
             self.deliver,
             self.diagnostics,
             first_event=self.initial_state.events,
-            reset_number=self._reset_number,
+            reset_number=self.reset_number,
             resume_stamps=self.resume_stamps,
         )
-        self._participant = RequestParticipant(self, self._name) if self._name in PARTICIPANTS else None
+        self._participant = RequestParticipant(self, self._name) if self._name in participant_names() else None
 
     def activate_node(self) -> None:
-        """Let the process hear what has come."""
+        """Deliver what has come, and all from now on."""
         self.recovery.record_input(ActivationChange(True))
         self.inbox.release()
 
     def deactivate_node(self) -> None:
-        """Let the process hear nothing, unless it hears on."""
+        """Deliver nothing from now on, unless the process is always listening."""
         self.recovery.record_input(ActivationChange(False))
         if not self.is_always_listening:
             self.inbox.hold()
@@ -125,105 +153,95 @@ class ProcessNode(ManagedNode):
             self._participant.answer_due_requests()
 
     def clean_up_node(self) -> None:
-        """Leave nothing behind: what the process knows is forgotten."""
+        """Forget all, also for recovery."""
         self.recovery.discard()
         self.recovery = Recovery(self, self._recovery_folder)
 
     def abandon_configuration(self) -> None:
-        """As any managed node; what another node left behind stays for the next try."""
+        """As any managed node; what a killed node left stays for the next try."""
         super().abandon_configuration()
         if self.recovery.recovered_state is None:
             self.recovery.discard()
 
     def shut_down_node(self) -> None:
-        """As when the node is told to end: after its part of the last map is saved, if one is to be."""
+        """As any managed node, but after the last save, if one is wanted."""
         if not self.save_on_shutdown:
             self.tear_down()
             return
         begin = time.monotonic()
 
-        def look() -> None:
+        def tear_down_if_saved() -> None:
             if self.poll_final_save() or time.monotonic() - begin > SAVE_TIMEOUT:
                 self.tear_down()
 
-        self.create_timer(_POLL, look, clock=self.diagnostics.steady_clock)
+        self.create_timer(_POLL, tear_down_if_saved, clock=self.diagnostics.steady_clock)
 
     def discard_recovery(self) -> None:
-        """Leave nothing behind for a node of the same name, unless it was left by another one."""
+        """Remove journal and checkpoint, unless they are those of a killed node that was not recovered."""
         if self.is_configured:
             self.recovery.discard()
 
-    def make_process(self, beginning: InitialState) -> Checkpointable:
-        """The process, made from the map that the node begins with.
+    def make_process(self, initial_state: InitialState) -> Checkpointable:
+        """The process in an initial state.
 
         :raises HmtSlamError: where the map lacks the state of the process.
         """
-        # It takes time, in which a signal has to be heard.
         row = process_row(self._name)
-        process: Checkpointable = row.make(self.configuration, beginning.read_part(self._name, row.state_class))
+        process: Checkpointable = row.make(self.configuration, initial_state.read_part(self._name, row.state_class))
         return process
 
     def _create_process(self) -> Checkpointable:
-        """The process, made from the beginning."""
         process = self.make_process(self.initial_state)
         if self.initial_state.lost and TrackingReset in SUBSCRIPTIONS[self._name]:
-            # Slam says so too, but not before this node could say otherwise.
+            # The one that slam sends may come after this node's first output.
             process.handle(TrackingReset(self.initial_state.events, 0))
         return process
 
     def reset(self, folder: str, reset_number: int = 0) -> None:
-        """Forget all, and go on from a map in which the robot may be anywhere, or from nothing.
+        """Forget all, and start again with a map in which the robot may be anywhere, or with nothing.
 
         :param folder: of the map, empty for nothing.
-        :param reset_number: number of the request that the node answers by that.
-        :raises HmtSlamError: where it is damaged, or the node's parameters do not go with it.
+        :param reset_number: number of the reset request.
+        :raises HmtSlamError: for a map that is damaged or does not match.
         """
         self.initial_state = InitialState(self, folder, lost=True, previous_scans=self.scans)
         self.process = self._create_process()
         self.inbox.reset(self.initial_state.events, reset_number)
-        self._reset_number = self.outbox.reset_number = reset_number
-        self.recovery.start_journal(self._journal_header())
+        self.reset_number = self.outbox.reset_number = reset_number
+        self._start_journal()
 
-    def _journal_header(self) -> JournalHeader:
-        """What the node is that begins anew."""
-        beginning = self.initial_state
+    def _start_journal(self) -> None:
+        initial_state = self.initial_state
+        self.recovery.start_journal(
+            self._journal_header(
+                events=initial_state.events, lost=initial_state.lost, previous_scans=initial_state.previous_scans
+            )
+        )
+
+    def _journal_header(self, **fields: Any) -> JournalHeader:  # noqa: ANN401  of the header
         return JournalHeader(
-            False,
-            beginning.events,
-            str(beginning.folder or ""),
-            beginning.lost,
-            beginning.previous_scans,
-            self._reset_number,
+            folder=str(self.initial_state.folder or ""),
+            reset_number=self.reset_number,
             received=dict(self.diagnostics.received),
             stamps=self.recovery.stamps,
+            **fields,
         )
 
     def _recovered_initial_state(self, recovered: RecoveredState) -> InitialState:
-        """The beginning of a node that goes on for another one that was killed."""
-        base = recovered.header
-        self._reset_number = base.reset_number
-        self.diagnostics.received.update(base.received)
-        if base.has_checkpoint:
-            return InitialState.from_checkpoint(self, recovered.checkpoint_folder, base)
-        return InitialState(self, base.folder, lost=base.lost, previous_scans=base.previous_scans)
+        header = recovered.header
+        self.reset_number = header.reset_number
+        self.diagnostics.received.update(header.received)
+        if header.has_checkpoint:
+            return InitialState.from_checkpoint(self, recovered.checkpoint_folder, header)
+        return InitialState(self, header.folder, lost=header.lost, previous_scans=header.previous_scans)
 
     @property
     def resume_stamps(self) -> Mapping[str, int]:
-        """{kind of measurement: stamp from which on the node wants them, ns}, also of the past; else the next ones."""
+        """{measurement type: stamp, ns} after which past measurements are wanted too; empty for new ones alone."""
         return {}
 
-    @property
-    def reset_number(self) -> int:
-        """Number of the last request to begin anew that was answered."""
-        return self._reset_number
-
-    @property
-    def is_recovering(self) -> bool:
-        """Whether the node hears again what another one of its name heard that was killed."""
-        return self._is_recovering
-
     def _configure(self) -> None:
-        """As any managed node, up to where a node of the same name was killed, if one was."""
+        """As any managed node; then recover the state of a killed node."""
         super()._configure()
         if self.recovery.recovered_state is not None:
             self._recover(self.recovery.recovered_state)
@@ -239,7 +257,7 @@ class ProcessNode(ManagedNode):
             self.outbox.resend(message)
         for value in recovered.inputs:
             self.replay_input(value)
-        self._is_recovering = False
+        self.is_recovering = False
         self.recovery.resume_journal()
         self.get_logger().warning(
             f"{self._name} was killed and goes on where it was: at keyframe event {recovered.header.events} and "
@@ -247,7 +265,7 @@ class ProcessNode(ManagedNode):
         )
 
     def replay_input(self, value: Message | ControlEvent) -> None:
-        """Do what was done with what was heard."""
+        """Handle an input from the journal."""
         if isinstance(value, ParameterChange):
             self.set_parameters([Parameter(value.name, value=json.loads(value.value))])
         elif not isinstance(value, ControlEvent):
@@ -257,19 +275,16 @@ class ProcessNode(ManagedNode):
         """{name: document} of what the node remembers beside its process."""
         return {}
 
-    def restore_node_state(self, state: Path) -> None:
-        """Take over what :meth:`node_state` gave.
-
-        :param state: the folder in which it is.
-        """
+    def restore_node_state(self, folder: Path) -> None:
+        """Restore :meth:`node_state` from the folder of a checkpoint."""
 
     @property
     def is_quiescent(self) -> bool:
-        """Whether process and memory are all that there is."""
+        """Whether the state of the process and :meth:`node_state` are the whole state of the node."""
         return True
 
     def on_configuration_changed(self, configuration: Configuration) -> None:
-        """Take note of new values, also for one that goes on where this node is killed."""
+        """Apply and record new values of parameters."""
         before, now = as_flat(self.configuration), as_flat(configuration)
         super().on_configuration_changed(configuration)
         if not self.is_configured:
@@ -279,50 +294,44 @@ class ProcessNode(ManagedNode):
                 self.recovery.record_input(ParameterChange(name, json.dumps(now[name])))
 
     def deliver(self, message: Message) -> None:
-        """Let the process handle a message and publish its answers."""
-        if isinstance(message, TrackingReset) and not self._is_recovering and self.recovery.is_repeated_reset(message):
+        """Let the process handle a message, and publish its outputs."""
+        if isinstance(message, TrackingReset) and not self.is_recovering and self.recovery.is_repeated_reset(message):
             return
         self.recovery.record_input(message)
-        said: list[Message] = []
+        outputs: list[Message] = []
         begin = time.perf_counter()
-        with self.diagnostics.measure(message, said):
-            said += self.process.handle(message)
+        with self.diagnostics.measure(message, outputs):
+            outputs += self.process.handle(message)
         self.recovery.add_busy_time(time.perf_counter() - begin)
-        for answer in said:
-            self._publish_output(answer)
-        self.publish_views(message, said)
+        for output in outputs:
+            self._publish_output(output)
+        self.publish_views(message, outputs)
         if self._participant is not None:
             self._participant.on_delivered(message)
         self._write_due_checkpoint()
 
-    def _publish_output(self, answer: Message) -> None:
-        if isinstance(answer, RealTimePose) and not self.is_active:
-            return  # neither of a moment that is over, nor of a node that takes no part
-        self.outbox.send(answer)
-        self.recovery.record_output(answer)
-        self.diagnostics.sent[type(answer).__name__] += 1
-        if isinstance(answer, Notice):
-            self.diagnostics.warn(answer.text)
+    def _publish_output(self, output: Message) -> None:
+        if isinstance(output, RealTimePose) and not self.is_active:
+            return
+        self.outbox.send(output)
+        self.recovery.record_output(output)
+        self.diagnostics.sent[type(output).__name__] += 1
+        if isinstance(output, Notice):
+            self.diagnostics.warn(output.text)
 
     def _write_due_checkpoint(self) -> None:
-        """Write a checkpoint where one is due and the state is a whole."""
-        events = self.inbox.events
+        """Write a checkpoint where one is due, between keyframe events of a quiescent node."""
+        events = self.inbox.order.events
         if not self.recovery.is_checkpoint_due or events is None or not self.is_quiescent:
             return
-        base = JournalHeader(
-            True,
-            events,
-            str(self.initial_state.folder or ""),
-            False,
-            0,
-            self._reset_number,
-            dict(self.diagnostics.received),
-            dict(self.outbox.sent),
-            self.recovery.stamps,
-            self.recovery.tracking_reset,
+        header = self._journal_header(
+            has_checkpoint=True,
+            events=events,
+            sent=dict(self.outbox.sent),
+            tracking_reset=self.recovery.tracking_reset,
         )
         begin = time.perf_counter()
-        self.recovery.write_checkpoint(base, {self._name: self.process.state, **self.node_state()})
+        self.recovery.write_checkpoint(header, {self._name: self.process.state, **self.node_state()})
         self._checkpoint_count += 1
         self.diagnostics.values["checkpoints"] = (
             f"{self._checkpoint_count}, the last in {time.perf_counter() - begin:.3f} s"
@@ -330,18 +339,127 @@ class ProcessNode(ManagedNode):
 
     @property
     def scans(self) -> int:
-        """Scans that have a pose, as far as the node gives it."""
+        """Number of scans with a pose, where the node gives them one."""
         return 0
 
     def poll_final_save(self) -> bool:
-        """Whether the node's part of the last map is saved, and the others had time to hear of it.
+        """Whether the node's part of the last map is saved, and its response delivered.
 
-        So that all come to the same keyframe event, an inactive node goes on for that.
+        An inactive node takes messages again for that, so that all nodes reach the same keyframe event.
         """
         if not self.is_configured:
             return True
         self.inbox.release()
         return self._participant is not None and self._participant.has_saved_final_part(_LINGER)
 
-    def publish_views(self, _heard: Message, _said: list[Message]) -> None:
-        """Publish what is for people to see; nothing, unless a node has something."""
+    def publish_views(self, message: Message, outputs: list[Message]) -> None:
+        """Publish what people see after a message and its outputs; by default nothing."""
+
+
+class _FirstSignal:
+    """Handler of SIGINT and SIGTERM in place of rclpy's; later signals are ignored.
+
+    :ivar received_at: time of the first signal by the monotonic clock, s, None before.
+    """
+
+    def __init__(self) -> None:
+        self.received_at: float | None = None
+        uninstall_signal_handlers()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self)
+
+    @property
+    def has_timed_out(self) -> bool:
+        """Whether the time for the last save is over."""
+        return self.received_at is not None and time.monotonic() - self.received_at > SAVE_TIMEOUT
+
+    def __call__(self, _number: int, _frame: object) -> None:
+        if self.received_at is None:
+            self.received_at = time.monotonic()
+            force_exit_after(SAVE_TIMEOUT + 1.0, 0)
+
+
+class RequestParticipant:
+    """Answers the coordinated requests of slam, each after the keyframe event that it names."""
+
+    def __init__(self, node: ProcessNode, name: str) -> None:
+        """Subscribe to the requests; ``name`` is that of the process."""
+        self._node, self._name = node, name
+        self._last_event_type = [kind for kind in CHAIN if kind in SUBSCRIPTIONS[name]][-1]
+        self._events = node.initial_state.events
+        self._requests: deque[SaveRequest | ResetRequest] = deque()
+        self._final_part_saved_at: float | None = None
+        self._responses = {
+            kind: node.create_publisher(String, DOCUMENTS[kind], topics.CHAIN) for kind in (SaveResponse, ResetResponse)
+        }
+        # A late node has to follow a reset too.
+        for kind, profile in ((SaveRequest, topics.VOLATILE_CHAIN), (ResetRequest, topics.CHAIN)):
+            subscribe_document(node, node.diagnostics, kind, self._on_request, profile)
+
+    def _on_request(self, request: SaveRequest | ResetRequest) -> None:
+        """Take a request, unless it is a reset that was answered before."""
+        if isinstance(request, SaveRequest) or request.number > self._node.reset_number:
+            self._requests.append(request)
+            self.answer_due_requests()
+
+    def on_delivered(self, message: Message) -> None:
+        """Count keyframe events, and answer the requests that wait for this one."""
+        if isinstance(message, self._last_event_type):
+            self._events += 1
+            self.answer_due_requests()
+
+    def has_saved_final_part(self, linger: float) -> bool:
+        """Whether the part of the last map was saved ``linger`` s ago, or there is nothing to save."""
+        return not self._events or (
+            self._final_part_saved_at is not None and time.monotonic() - self._final_part_saved_at >= linger
+        )
+
+    def answer_due_requests(self) -> None:
+        """Answer requests whose keyframe event has come; those of a holding inbox too, for which it never will."""
+        while self._requests and (self._events >= self._requests[0].events or self._node.inbox.is_holding):
+            self._answer(self._requests.popleft())
+
+    def _answer(self, request: SaveRequest | ResetRequest) -> None:
+        fault = self._event_mismatch(request)
+        if isinstance(request, ResetRequest):
+            self._respond(ResetResponse(request.number, self._name, fault or self._reset(request)))
+            self._node.inbox.deliver_early()
+            return
+        files: tuple[FileRecord, ...] = ()
+        if not fault:
+            files, fault = self._write_part(request)
+        self._respond(SaveResponse(request.number, self._name, files, fault))
+        if request.shutdown:
+            self._final_part_saved_at = time.monotonic()
+
+    def _respond(self, response: SaveResponse | ResetResponse) -> None:
+        self._responses[type(response)].publish(String(data=encode(response)))
+
+    def _event_mismatch(self, request: SaveRequest | ResetRequest) -> str:
+        """Fault where the process is at another keyframe event; a reset may come after fewer."""
+        if self._events > request.events:
+            return f"it is at keyframe event {self._events}, not {request.events}: restart all nodes"
+        if self._events < request.events and isinstance(request, SaveRequest):
+            return f"it is inactive, at keyframe event {self._events} of {request.events}: activate it"
+        return ""
+
+    def _reset(self, request: ResetRequest) -> str:
+        """Reset the node; return the fault, if any."""
+        try:
+            self._node.reset(request.folder, request.number)
+        except HmtSlamError as fault:
+            return f"{fault}; restart all nodes"
+        self._events = self._node.initial_state.events
+        return ""
+
+    def _write_part(self, request: SaveRequest) -> tuple[tuple[FileRecord, ...], str]:
+        """Write the node's part of the map; return its files, or the fault."""
+        folder = Path(request.folder)
+        if not folder.is_dir():
+            return (), f"it does not see the folder {folder}: run all nodes where that is, or set save_to of slam"
+        try:
+            writer = FolderWriter(folder)
+            writer.write(self._name, self._node.process.state)
+        except OSError as error:
+            return (), f"{folder} cannot be written ({error.strerror})"
+        return writer.files, ""

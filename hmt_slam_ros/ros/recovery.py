@@ -1,13 +1,12 @@
-"""How a node that was killed goes on: from its last checkpoint, with what it heard since.
+"""Recovery of a node that was killed: from its last checkpoint and a journal of its inputs since.
 
-Each value is a line of JSON that names its type; arrays are in a file beside it, written before the line. A line that
-was not written to its end, as the process was killed, is no line. Nothing is flushed to the disk itself: a process that
-is killed takes nothing with it that the system has taken over.
+A process is a value machine: the same state and the same inputs in the same order give the same result, bit for bit. So
+a node writes every input to the journal before its process handles it, and at times the state of its process. Its
+successor, of the same name and folder, starts with that state and handles the inputs again. What it sends again the
+others recognize by sequence numbers. docs/decisions/0033-journal-recovery.md has the reasons.
 
-A process is a value machine: from the same state and the same messages in the same order it goes on to the same bit. So
-a node writes down every message before its process hears it, and now and then the state of its process. Another node of
-the same name and folder begins with that state, hears the messages again and says what it said again, which the others
-recognize by its numbers. docs/decisions/0033-journal-recovery.md has the reasons.
+Each value is a line of JSON that names its type. Arrays are in a file beside it, written before the line. An incomplete
+last line is ignored. Nothing is flushed to the disk, since the system keeps what a killed process has written.
 """
 
 from __future__ import annotations
@@ -41,26 +40,22 @@ _FORMAT_DOC = "docs/decisions/0033-journal-recovery.md"
 
 
 class JournalEntry(NamedTuple):
-    """A value in a journal.
-
-    :ivar role: what it is there for.
-    :ivar value: itself.
-    """
+    """A value in a journal with its role: header, output or input."""
 
     role: str
     value: object
 
 
 class Journal:
-    """A journal that is written, a pair of files ``<stem>.jsonl`` and ``<stem>.bin``.
+    """Writer of a journal, the files ``<stem>.jsonl`` and ``<stem>.bin``.
 
     :ivar size: bytes written.
     """
 
     def __init__(self, folder: Path, stem: str) -> None:
-        """Begin it.
+        """Create the files.
 
-        :raises OSError: where it cannot be written.
+        :raises OSError: where that fails.
         """
         self.size = 0
         self._lines = (folder / f"{stem}.{_LINES}").open("xb", buffering=0)
@@ -70,7 +65,7 @@ class Journal:
     def append(self, role: str, value: object) -> None:
         """Write a value.
 
-        :raises OSError: where it cannot be written.
+        :raises OSError: where that fails.
         """
         content = to_plain(value, {np.ndarray: self._arrays.store})
         self._bytes.flush()
@@ -81,17 +76,17 @@ class Journal:
         self.size = self._bytes.tell() + self._lines.tell()
 
     def close(self) -> None:
-        """Write nothing more."""
+        """Close the files."""
         self._lines.close()
-        with suppress(OSError):  # what a full disk did not take, of which there is no line either
+        with suppress(OSError):  # a full disk refused bytes that no line refers to
             self._bytes.close()
 
 
 def read_journal(folder: Path, stem: str, kinds: Mapping[str, type]) -> Iterator[JournalEntry]:
     """The values of a journal in their order.
 
-    :param kinds: {name: type} of those that it may hold.
-    :raises HmtSlamError: where it holds something else.
+    :param kinds: {name: type} of the allowed values.
+    :raises HmtSlamError: where the journal is damaged.
     """
     arrays = ArrayReader((folder / f"{stem}.{_ARRAYS}").read_bytes())
     values = PlainDataReader(_FORMAT_DOC, {np.ndarray: arrays.reader})
@@ -107,34 +102,37 @@ def read_journal(folder: Path, stem: str, kinds: Mapping[str, type]) -> Iterator
 
 
 CHECKPOINT = "hmt_checkpoint"
-"""The format of the folder of a checkpoint."""
+"""Format of the folder of a checkpoint."""
 
-# A checkpoint is due when the node computed this many times as long as the last one took, which bounds what checkpoints
-# cost, and how long another node takes to catch up.
 _CHECKPOINT_RATIO = 20.0
-_FIRST_COST = 0.05  # s, before one was written
-_LARGEST = 64_000_000  # bytes of a journal, for a robot that stands still
-# What the node said last may not have reached the others when it was killed: it is said again. More than DDS has under
-# way at any time.
+"""Computing time in a journal, in durations of the last checkpoint, after which one is due.
+
+It bounds the cost of checkpoints, and the time that a successor takes to catch up.
+"""
+_FIRST_CHECKPOINT_SECONDS = 0.05
+"""Assumed duration of the first checkpoint, s."""
+_MAX_JOURNAL_SIZE = 64_000_000
+"""Size of a journal above which a checkpoint is due, bytes; for a robot that stands still."""
 _RESENT_MESSAGES = 64
+"""Outputs that are sent again, as they may not have reached the others; more than DDS has under way at any time."""
 _HEADER, _OUTPUT, _INPUT = "base", "said", "heard"
 _STATE, _PARTIAL = "state", ".partial"
 
 
 @dataclass(frozen=True, eq=False)
 class JournalHeader:
-    """What a node was when its journal began.
+    """A node at the start of a journal.
 
-    :ivar has_checkpoint: whether its state is beside the journal; else the process began with ``folder``.
-    :ivar events: keyframe events that it had heard to the end.
-    :ivar folder: of the map that it began with, empty without.
-    :ivar lost: whether the robot may be anywhere in that.
-    :ivar previous_scans: scans that had a pose before.
-    :ivar reset_number: number of the last request to begin anew that it answered.
-    :ivar received: {kind of message: how many it heard}.
-    :ivar sent: {kind of message: how many it said}, of those that are counted for the others.
-    :ivar stamps: {kind of measurement: stamp of the last one that it heard, ns}.
-    :ivar tracking_reset: the last such message that it heard, if any.
+    :ivar has_checkpoint: whether a checkpoint is beside the journal; else the process started from ``folder``.
+    :ivar events: number of complete keyframe events.
+    :ivar folder: of the map that the node started from, empty without.
+    :ivar lost: whether the robot may be anywhere in that map.
+    :ivar previous_scans: number of scans with a pose before.
+    :ivar reset_number: number of the last reset request that was answered.
+    :ivar received: {message type: number received}.
+    :ivar sent: {message type: number sent}, as in ``Outbox.sent``.
+    :ivar stamps: {measurement type: stamp of the last one received, ns}.
+    :ivar tracking_reset: the last one received, if any.
     """
 
     has_checkpoint: bool = False
@@ -151,11 +149,7 @@ class JournalHeader:
 
 @dataclass(frozen=True)
 class ParameterChange:
-    """A parameter that was changed while the node ran.
-
-    :ivar name: of the parameter.
-    :ivar value: the new one, in YAML.
-    """
+    """A parameter was changed; ``value`` is JSON."""
 
     name: str
     value: str
@@ -163,30 +157,24 @@ class ParameterChange:
 
 @dataclass(frozen=True)
 class PauseChange:
-    """Slam was told to pass scans over, or to go on.
-
-    :ivar paused: whether it passes them over.
-    """
+    """Slam was paused or resumed."""
 
     paused: bool
 
 
 @dataclass(frozen=True)
 class ActivationChange:
-    """The node was activated, or deactivated.
-
-    :ivar active: whether it takes part.
-    """
+    """The node was activated or deactivated."""
 
     active: bool
 
 
 @dataclass(frozen=True, eq=False)
 class FrameMounting:
-    """Slam heard where a laser is on the robot.
+    """The pose of a laser on the robot was received.
 
-    :ivar frame: of the frame of its scans.
-    :ivar laser_pose: shape (3,), ``base_T_laser`` as (x, y, theta) in m and rad.
+    :ivar frame: of its scans.
+    :ivar laser_pose: ``base_T_laser`` (3,), (x, y, theta) in m and rad.
     :ivar angle_sign: 1.0, or -1.0 for a laser mounted upside down.
     """
 
@@ -195,19 +183,19 @@ class FrameMounting:
     angle_sign: float
 
 
-# What a node is told beside messages, and knows until it is told otherwise.
 ControlEvent = ParameterChange | PauseChange | ActivationChange | FrameMounting
+"""An input beside messages, which holds until the next one of its kind."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecoveredState:
-    """What a node of the same name left behind.
+    """State of a node of the same name that was killed.
 
-    :ivar header: what it was when its journal began.
-    :ivar checkpoint_folder: the folder of its checkpoint.
-    :ivar outputs: what it said last before that.
-    :ivar inputs: what it heard since, in its order.
-    :ivar was_active: whether it took part when it was killed, None where nobody had told it so far.
+    :ivar header: of the journal.
+    :ivar checkpoint_folder: folder of the checkpoint.
+    :ivar outputs: the last ones before the journal.
+    :ivar inputs: the journal's, in their order.
+    :ivar was_active: whether the node was active when it was killed, None where it had never been told.
     """
 
     header: JournalHeader
@@ -223,26 +211,28 @@ _JOURNAL_TYPES: dict[str, type] = {
 
 
 def _subject(event: ControlEvent) -> str:
-    """What a control event is about: the parameter, the frame, or the node itself."""
+    """Parameter or frame of a control event, empty for the node itself."""
     if isinstance(event, ParameterChange):
         return event.name
     return event.frame if isinstance(event, FrameMounting) else ""
 
 
 class Recovery:
-    """Checkpoints and journal of a node; nothing where the parameter ``recovery`` is not set.
+    """Checkpoints and journal of a node; none where the parameter ``recovery`` is not set.
 
-    A generation is a folder with a journal and mostly the checkpoint that it goes on from. The newest one that is
-    complete counts; it gets its name when it is.
+    A generation is a folder with a journal and mostly the checkpoint before it. It gets its final name when it is
+    complete; the newest such one counts.
 
-    :ivar recovered_state: what a node of the same name left behind, None where this one is the first.
+    :ivar recovered_state: state of a node of the same name that was killed, None without.
+    :ivar stamps: {measurement type: stamp of the last one received, ns}.
+    :ivar tracking_reset: the last one received, None without.
     """
 
     def __init__(self, node: ManagedNode, folder: str) -> None:
-        """Look for what was left behind.
+        """Read what a killed node left.
 
         :param folder: of all nodes, empty for none.
-        :raises HmtSlamError: where it is damaged.
+        :raises HmtSlamError: where a journal is damaged.
         """
         self._node = node
         name = node.get_fully_qualified_name().strip("/").replace("/", ".")
@@ -251,9 +241,9 @@ class Recovery:
         self._journal: Journal | None = None
         self._recent_outputs: deque[Message] = deque(maxlen=_RESENT_MESSAGES)
         self._control_state: dict[tuple[type, str], ControlEvent] = {}
-        self._stamps: dict[str, int] = {}
-        self._tracking_reset: TrackingReset | None = None
-        self._checkpoint_seconds, self._busy_seconds = _FIRST_COST, 0.0
+        self.stamps: dict[str, int] = {}
+        self.tracking_reset: TrackingReset | None = None
+        self._checkpoint_seconds, self._busy_seconds = _FIRST_CHECKPOINT_SECONDS, 0.0
         self.recovered_state = None if self._folder is None else self._read_recovered_state(self._folder)
 
     def _read_recovered_state(self, folder: Path) -> RecoveredState | None:
@@ -264,81 +254,72 @@ class Recovery:
         newest = folders[self._generation]
         self._segment = len(list(newest.glob("*.jsonl")))
         entries = [e for number in range(self._segment) for e in read_journal(newest, str(number), _JOURNAL_TYPES)]
-        base = entries[0].value
-        assert isinstance(base, JournalHeader)
-        self._stamps, self._tracking_reset = dict(base.stamps), base.tracking_reset
+        header = entries[0].value
+        assert isinstance(header, JournalHeader)
+        self.stamps, self.tracking_reset = dict(header.stamps), header.tracking_reset
         for entry in entries:
             self._track(entry)
-        heard = [e.value for e in entries if e.role == _INPUT]
-        told = self._control_state.get((ActivationChange, ""))
-        active = told.active if isinstance(told, ActivationChange) else None
-        return RecoveredState(base, newest / _STATE, list(self._recent_outputs), heard, active)  # type: ignore[arg-type]
+        inputs = [e.value for e in entries if e.role == _INPUT]
+        activation = self._control_state.get((ActivationChange, ""))
+        active = activation.active if isinstance(activation, ActivationChange) else None
+        return RecoveredState(header, newest / _STATE, list(self._recent_outputs), inputs, active)  # type: ignore[arg-type]
 
     def _track(self, entry: JournalEntry) -> None:
-        """Keep what the next generation begins with."""
+        """Keep what the next generation starts with."""
         value = entry.value
         if isinstance(value, ControlEvent):
             self._control_state[type(value), _subject(value)] = value
         elif entry.role == _OUTPUT:
             self._recent_outputs.append(value)  # type: ignore[arg-type]
         elif isinstance(value, TrackingReset):
-            self._tracking_reset = value
+            self.tracking_reset = value
         elif isinstance(value, Scan | Odometry):
-            self._stamps[type(value).__name__] = value.stamp
-
-    @property
-    def stamps(self) -> Mapping[str, int]:
-        """{kind of measurement: stamp of the last one that was heard, ns}."""
-        return dict(self._stamps)
-
-    @property
-    def tracking_reset(self) -> TrackingReset | None:
-        """The last such message that was heard, if any."""
-        return self._tracking_reset
+            self.stamps[type(value).__name__] = value.stamp
 
     def is_repeated_reset(self, tracking_reset: TrackingReset) -> bool:
-        """Whether the robot arrived so before: slam says it again when it was killed, and DDS when this node was."""
-        last = self._tracking_reset
+        """Whether this one was received before: a killed slam sends it again, and so does DDS to a killed node."""
+        last = self.tracking_reset
         return last is not None and (tracking_reset.scans_before, tracking_reset.event) <= (
             last.scans_before,
             last.event,
         )
 
     def record_input(self, value: Message | ControlEvent) -> None:
-        """Write down what the process is about to hear."""
+        """Write an input to the journal, before it is handled."""
         entry = JournalEntry(_INPUT, value)
         self._track(entry)
         self._append(entry)
 
     def record_output(self, message: Message) -> None:
-        """Keep what the process says; a pose by dead reckoning is past when it is said again."""
+        """Keep an output to send it again, unless it is a pose by dead reckoning, which would be outdated."""
         if not isinstance(message, RealTimePose):
             self._recent_outputs.append(message)
 
     def add_busy_time(self, seconds: float) -> None:
-        """Count the time of computing."""
+        """Add to the computing time since the last checkpoint."""
         self._busy_seconds += seconds
 
     @property
     def is_checkpoint_due(self) -> bool:
-        """Whether a checkpoint is worth what it costs."""
+        """Whether a checkpoint is worth its cost."""
         return self._journal is not None and (
-            self._busy_seconds > _CHECKPOINT_RATIO * self._checkpoint_seconds or self._journal.size > _LARGEST
+            self._busy_seconds > _CHECKPOINT_RATIO * self._checkpoint_seconds or self._journal.size > _MAX_JOURNAL_SIZE
         )
 
     def start_journal(self, header: JournalHeader) -> None:
-        """Begin a journal without a checkpoint; what was heard and said before is of no use any more."""
+        """Start a journal without a checkpoint, and forget earlier outputs."""
         self._recent_outputs.clear()
-        self._tracking_reset = None
+        self.tracking_reset = None
         try:
             self._start_generation(header, lambda _: None)
         except OSError as fault:
             self._disable(fault)
 
     def write_checkpoint(self, header: JournalHeader, documents: Mapping[str, object]) -> None:
-        """Write the state of the node and go on with a new journal.
+        """Write a checkpoint, and start a new journal.
 
-        :param documents: {name: value} of which the state consists.
+        :param header: of the journal.
+        :param documents: {name: value}, the state of the node.
         """
         begin = time.perf_counter()
 
@@ -349,12 +330,12 @@ class Recovery:
             writer.write_text(CONFIGURATION, ros_yaml(self._node.configuration))
             writer.finish(CHECKPOINT, VERSION)
 
-        with suppress(OSError):  # the journal goes on; where there is no room for that either, it tells
+        with suppress(OSError):  # the old journal goes on, and reports a full disk itself
             self._start_generation(header, write)
         self._checkpoint_seconds, self._busy_seconds = time.perf_counter() - begin, 0.0
 
     def resume_journal(self) -> None:
-        """Go on with the journal that was found."""
+        """Continue the journal of the killed node."""
         assert self._folder is not None
         newest = self._folder / str(self._generation)
         for other in self._folder.iterdir():
@@ -366,32 +347,32 @@ class Recovery:
             self._disable(fault)
 
     def discard(self) -> None:
-        """Leave nothing behind, as the node ends in good order."""
+        """Remove journal and checkpoint, as the node ends in good order."""
         if self._journal is not None:
             self._journal.close()
             self._journal = None
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _start_generation(self, base: JournalHeader, write: Callable[[Path], None]) -> None:
-        """Begin the next generation, and remove the one before.
+    def _start_generation(self, header: JournalHeader, write: Callable[[Path], None]) -> None:
+        """Start the next generation, and remove the one before.
 
-        :raises OSError: where it cannot be written; the one before is as it was.
+        :raises OSError: where that fails; the one before is kept.
         """
         if self._folder is None:
             return
-        made = self._folder / str(self._generation + 1)
-        partial = made.with_suffix(_PARTIAL)
+        complete = self._folder / str(self._generation + 1)
+        partial = complete.with_suffix(_PARTIAL)
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         write(partial)
         journal = Journal(partial, "0")
-        journal.append(_HEADER, base)
-        for told in self._control_state.values():
-            journal.append(_INPUT, told)
+        journal.append(_HEADER, header)
+        for event in self._control_state.values():
+            journal.append(_INPUT, event)
         for message in self._recent_outputs:
             journal.append(_OUTPUT, message)
-        partial.rename(made)
+        partial.rename(complete)
         before, self._journal = self._journal, journal
         if before is not None:
             before.close()
@@ -407,7 +388,7 @@ class Recovery:
             self._disable(fault)
 
     def _disable(self, fault: OSError) -> None:
-        """Go on without; what is there would lack what comes now."""
+        """Continue without recovery, since the journal would have a gap."""
         self.discard()
         self._node.diagnostics.warn(
             f"{self._folder} cannot be written ({fault.strerror}): the node goes on, but if it is killed all have to "
@@ -416,12 +397,10 @@ class Recovery:
 
 
 def declare_recovery(node: Node) -> str:
-    """The folder, from the parameter ``recovery``."""
-    return str(node.declare_parameter("recovery", "", _DESCRIPTOR).value)
-
-
-_DESCRIPTOR = ParameterDescriptor(
-    description="Folder in which the node keeps what another one of its name needs to go on where it was killed; empty "
-    "for none.",
-    read_only=True,
-)
+    """Declare ``recovery``, and return the folder, empty for none."""
+    descriptor = ParameterDescriptor(
+        description="Folder in which the node keeps what another one of its name needs to go on where it was killed; "
+        "empty for none.",
+        read_only=True,
+    )
+    return str(node.declare_parameter("recovery", "", descriptor).value)

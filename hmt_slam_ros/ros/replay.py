@@ -1,181 +1,154 @@
-"""A whole run of the robot node and the process nodes, each an OS process of its own, into an output folder."""
+"""Replay of a log by the nodes, each an OS process, with a recorder that fills an output folder."""
 
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict, deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import IO
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_msgs.msg import Float64MultiArray, String
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.documents import ros_yaml, yaml_value
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.messages.documents import RobotStatus, decode
+from hmt_slam_ros.messages.messages import AreaEvents, Message
+from hmt_slam_ros.messages.routing import SUBSCRIPTIONS
 from hmt_slam_ros.open_log import is_simulated, open_log
-from hmt_slam_ros.process_table import COORDINATOR, consumer_count, node_command, process_names
+from hmt_slam_ros.process_table import COORDINATOR, RECORDER, consumer_count, process_names, producer
 from hmt_slam_ros.results.final_map import deskewed_scans, final_map
 from hmt_slam_ros.results.output_folder import RunMetrics, atomic_output, write_output
-from hmt_slam_ros.results.recorder import Recording
-from hmt_slam_ros.ros.diagnostics import peak_rss
-from hmt_slam_ros.ros.domain import own_domain
-from hmt_slam_ros.ros.execution import PARENT_VARIABLE, wait_until_alone
-from hmt_slam_ros.ros.recorder_node import RecorderNode
-from hmt_slam_ros.ros.transforms import TFMessage
+from hmt_slam_ros.results.recorder import Recorder, Recording
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.conversions import stamp_from_time
+from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
+from hmt_slam_ros.ros.execution import wait_until_alone
+from hmt_slam_ros.ros.message_io import Inbox
+from hmt_slam_ros.ros.node_processes import NodeProcesses, ResourceUsage, own_domain
+from hmt_slam_ros.ros.topics import COST, DIAGNOSTICS, ROBOT_STATUS, TFMessage
 from hmt_slam_ros.sensors import Scan
 
-_STOP_TIMEOUT = 5.0  # s for a node to end when it is told to
-# A node that is killed more often within a minute would be so for ever.
-_RESTARTS, _RESTART_WINDOW = 3, 60.0
-_TAIL = 3  # lines of a node's stderr that go into a message
-
-
-@dataclass(frozen=True)
-class ResourceUsage:
-    """What an OS process used so far.
-
-    :ivar peak_rss: largest resident memory, bytes.
-    :ivar cpu_seconds: user and system time.
-    """
-
-    peak_rss: int
-    cpu_seconds: float
-
-
-class NodeProcesses:
-    """Node processes; as a context, all of them are gone at its end.
-
-    :ivar processes: {node: process}.
-    """
-
-    def __init__(self, folder: Path, restartable: Collection[str], notify: Callable[[str], None]) -> None:
-        """Start nothing yet.
-
-        :param folder: for what the nodes write to stderr.
-        :param restartable: nodes that are started again where a signal killed them.
-        :param notify: called with one sentence where that is done.
-        """
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._folder, self._restartable, self._notify = folder, restartable, notify
-        self._start_arguments: dict[str, tuple[Sequence[str], Mapping[str, str]]] = {}
-        self._restart_times: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_RESTARTS))
-
-    def start(self, name: str, arguments: Sequence[str], environment: Mapping[str, str]) -> None:
-        """Start the node ``name`` with arguments for ROS."""
-        self._start_arguments[name] = arguments, environment
-        command = [sys.executable, *node_command(name), "--ros-args", *arguments]
-        with self._open_log(name, "ab") as stderr:
-            self.processes[name] = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=stderr,
-                stderr=stderr,
-                # A Ctrl-C in the terminal reaches this process alone, which then ends the nodes in good order.
-                start_new_session=True,
-                env={**environment, PARENT_VARIABLE: str(os.getpid())},
-            )
-
-    def _open_log(self, name: str, mode: str) -> IO[bytes]:
-        return (self._folder / f"{name}.log").open(mode)
-
-    def restart_killed(self) -> None:
-        """See whether all are alive; start those again that were killed.
-
-        :raises HmtSlamError: for one that ended by itself or is killed again and again, with what it said last.
-        """
-        for name, process in list(self.processes.items()):
-            if (status := process.poll()) is None:
-                continue
-            if status >= 0 or name not in self._restartable:
-                raise HmtSlamError(f"the node {name} ended with status {status}, it said: {self.log_tail(name)}")
-            self._restart(name, -status)
-
-    def _restart(self, name: str, number: int) -> None:
-        now, before = time.monotonic(), self._restart_times[name]
-        if len(before) == _RESTARTS and now - before[0] < _RESTART_WINDOW:
-            raise HmtSlamError(
-                f"the node {name} was killed by signal {number} for the {_RESTARTS + 1}th time within a minute and is "
-                f"not started again, it said: {self.log_tail(name)}"
-            )
-        before.append(now)
-        self._notify(f"the node {name} was killed by signal {number}: it is started again and goes on where it was")
-        self.start(name, *self._start_arguments[name])
-
-    def log_tail(self, name: str) -> str:
-        """The last lines that a node wrote, as one."""
-        with self._open_log(name, "rb") as stderr:
-            lines = stderr.read().decode(errors="replace").strip().splitlines()
-        return " | ".join(line.strip() for line in lines[-_TAIL:]) or "nothing"
-
-    def usage(self) -> dict[str, ResourceUsage]:
-        """What each node used so far."""
-        return {
-            name: ResourceUsage(peak_rss(process.pid), _cpu_seconds(process.pid))
-            for name, process in self.processes.items()
-        }
-
-    def stop(self) -> None:
-        """End all: by SIGINT, and by SIGKILL those that do not hear it."""
-        alive = [process for process in self.processes.values() if process.poll() is None]
-        for process in alive:
-            process.send_signal(signal.SIGINT)
-        deadline = time.monotonic() + _STOP_TIMEOUT
-        for process in alive:
-            try:
-                process.wait(max(0.0, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-
-    def __enter__(self) -> NodeProcesses:
-        """Nothing runs yet."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """End all, whatever happened."""
-        self.stop()
-
-
-def _cpu_seconds(pid: int) -> float:
-    """User and system time of an OS process; 0 where the system does not tell."""
-    try:
-        line = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return 0.0
-    # Fields 14 and 15; the second, in parentheses, may hold spaces.
-    ticks = line.rpartition(")")[2].split()[11:13]
-    return sum(map(int, ticks)) / float(os.sysconf("SC_CLK_TCK"))
-
-
-# On a slow computer the first run compiles for a while before anything is said.
-STALL_TIMEOUT = 180.0  # s
-_DISCOVERY_TIMEOUT = 60.0  # s
+STALL_TIMEOUT = 180.0
+"""Time without any message after which a run is given up, s; a first run may compile kernels that long."""
+_DISCOVERY_TIMEOUT = 60.0
+"""Time in which the nodes must find each other, s."""
+_DIAGNOSTICS_TIMEOUT = 3.0
+"""Time to wait for the last diagnostics, which come once a second, s."""
+_SHUTDOWN_TIMEOUT = 2.0
+"""Time to wait for the end of the nodes, s."""
 _SPIN = 0.05  # s
-_DIAGNOSTICS_TIMEOUT = 3.0  # s
-_SHUTDOWN_TIMEOUT = 2.0  # s
+_DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"  # environment variable
+
+
+class RecorderNode(Node):
+    """Node of the recorder, in the process that started the other nodes.
+
+    :ivar recorder: the recorder.
+    :ivar message_count: number of messages received, as a sign of progress.
+    :ivar robot_status: the last status of the robot, None before the first.
+    :ivar diagnostics_stamps: {node: stamp of its last diagnostics, ns}.
+    :ivar fault: sentence of a node about a fault that ends the run, None without.
+    """
+
+    def __init__(self, configuration: Configuration, context: Context) -> None:
+        super().__init__(RECORDER.name, context=context)
+        self.recorder = Recorder(configuration)
+        self.message_count = 0
+        self.robot_status: RobotStatus | None = None
+        self.diagnostics_stamps: dict[str, int] = {}
+        self.fault: str | None = None
+        self._costs: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
+        self.area_event_count = 0
+        self._diagnostics = NodeDiagnostics(self)
+        self._inbox = Inbox(
+            self, (*SUBSCRIPTIONS[RECORDER.name], AreaEvents), self._on_message, self._diagnostics, topics.CHAIN
+        )
+        self.create_subscription(String, ROBOT_STATUS, self._on_robot_status, topics.LATCHED)
+        self.create_subscription(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, topics.STREAM)
+        self.create_subscription(Float64MultiArray, COST, self._on_cost, topics.CHAIN)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all messages of the run have come."""
+        counts = self._inbox.final_counts
+        return (
+            counts is not None
+            and self.recorder.is_complete
+            and len(self.recorder.keyframes) >= counts.keyframes
+            and len(self.recorder.scan_poses) >= counts.scan_poses
+        )
+
+    def awaited_node(self) -> str:
+        """The node from which the next message is due."""
+        recorder = self.recorder
+        if len(recorder.decisions) < len(recorder.hypotheses):
+            return producer("ClosureDecision")
+        if len(recorder.hypotheses) < self.area_event_count:
+            return producer("Hypotheses")
+        if self.area_event_count < len(recorder.keyframes):
+            return producer("AreaEvents")
+        if self.robot_status is None or (
+            self.robot_status.state != "ended" and self.robot_status.acknowledged >= self.robot_status.scans
+        ):
+            return "robot"
+        return producer("Keyframe")
+
+    def seconds_per_scan(self, stamps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+        """Computing time of every process for each scan, {process: shape (n,), s}.
+
+        :param stamps: of all scans, shape (n,), ns, increasing.
+        """
+        seconds = {}
+        for name, batches in sorted(self._costs.items()):
+            rows = np.concatenate(batches)
+            cost_stamps = rows[:, 0].astype(np.int64) * NANOSECONDS + rows[:, 1].astype(np.int64)
+            scans = np.clip(np.searchsorted(stamps, cost_stamps, side="left"), 0, stamps.size - 1)
+            seconds[name] = np.bincount(scans, rows[:, 2], minlength=stamps.size).astype(np.float64)
+        return seconds
+
+    def _on_message(self, message: Message) -> None:
+        self.message_count += 1
+        self.area_event_count += isinstance(message, AreaEvents)
+        self.recorder.handle(message)
+
+    def _on_robot_status(self, message: String) -> None:
+        status = decode(message.data, RobotStatus)
+        if self.robot_status is None or status.scans > self.robot_status.scans:
+            self.message_count += 1
+        self.robot_status = status
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            name = status.name.rsplit("/", 1)[-1]
+            self.diagnostics_stamps[name] = stamp_from_time(message.header.stamp)
+            if status.level == DiagnosticStatus.ERROR and self.fault is None:
+                self.fault = f"{name}: {status.message}"
+
+    def _on_cost(self, message: Float64MultiArray) -> None:
+        rows = np.frombuffer(message.data, dtype=np.float64).reshape(-1, 3)
+        self._costs[message.layout.dim[0].label].append(rows)
 
 
 @dataclass(frozen=True, eq=False)
 class ReplayResult:
-    """What a replay came to.
+    """Result of a replay.
 
     :ivar recording: the map and the trajectories.
-    :ivar wall_seconds: from the start of the nodes to the last answer.
+    :ivar wall_seconds: from the start of the nodes to their last message.
     """
 
     recording: Recording
@@ -190,14 +163,14 @@ def replay(
     stall_timeout: float = STALL_TIMEOUT,
     view_port: int | None = None,
 ) -> ReplayResult:
-    """Run a log through the nodes, in a domain of their own, and write the output folder.
+    """Replay a log by the nodes, in a domain of their own, and write the output folder.
 
-    :param log: any log; ``configuration.robot`` says which part, and how fast.
-    :param output: the folder; nothing is left there unless all goes well.
-    :param progress: called with the number of scans that are worked off.
-    :param stall_timeout: seconds without any message after which the run is given up.
-    :param view_port: port on which the live page is served, None for no page.
-    :raises HmtSlamError: for a log that cannot be read, a node that dies, or a run that stands still.
+    :param log: any log; ``configuration.robot`` has its part and the rate.
+    :param output: the folder, which is written only where the run succeeds.
+    :param progress: called with the number of processed scans.
+    :param stall_timeout: time without any message after which the run is given up, s.
+    :param view_port: port of the live page, None for no page.
+    :raises HmtSlamError: for an unreadable log, a node that ends, or a run that stalls.
     """
     if configuration.robot.drive == "commands":
         raise HmtSlamError("robot.drive = commands is for the robot node alone: set it to log for a replay")
@@ -214,7 +187,7 @@ def replay(
         recording = run.recorder_node.recorder.finish(contents.stamps)
         final = final_map(recording, deskewed_scans(opened, configuration), configuration)
         refinement = time.process_time() - begin
-        figures = RunMetrics(
+        metrics = RunMetrics(
             log=opened.name,
             runtime="nodes",
             seconds_per_scan=run.recorder_node.seconds_per_scan(contents.stamps),
@@ -223,17 +196,17 @@ def replay(
             cpu_seconds=sum(usage.cpu_seconds for usage in run.usage.values()) + refinement,
             refinement_seconds=refinement,
         )
-        write_output(folder, final, contents.source_stamps, figures, configuration)
+        write_output(folder, final, contents.source_stamps, metrics, configuration)
     return ReplayResult(final.recording, run.wall_seconds)
 
 
 @dataclass(frozen=True, eq=False)
 class _LogContents:
-    """What has to be known of a log beforehand; finding it out also shows whether the log is whole.
+    """Contents of a log, from a pass that also shows whether it can be read.
 
-    :ivar stamps: shape (n,), of every scan on the log's running clock, ns.
-    :ivar source_stamps: shape (n,), the log's own stamps of them, ns.
-    :ivar laser_poses: the different ``base_T_laser`` (3,).
+    :ivar stamps: of the scans on the log's running clock, shape (n,), ns.
+    :ivar source_stamps: of the scans in the log, shape (n,), ns.
+    :ivar laser_poses: the distinct ``base_T_laser`` (3,).
     """
 
     stamps: NDArray[np.int64]
@@ -253,7 +226,7 @@ def _read_contents(log: Log) -> _LogContents:
 
 
 def _slam_arguments(laser_poses: list[list[float]]) -> list[str]:
-    """Where there is no tf2_msgs to say it on /tf_static, a parameter tells slam where the laser is."""
+    """Arguments of slam: the laser's pose, where tf2_msgs is not installed for /tf_static."""
     if TFMessage is not None:
         return []
     if len(laser_poses) > 1:
@@ -262,11 +235,11 @@ def _slam_arguments(laser_poses: list[list[float]]) -> list[str]:
 
 
 class _ReplayRun:
-    """One run of the nodes, and the recorder that listens.
+    """One run of the nodes with the recorder.
 
     :ivar recorder_node: the recorder's node.
-    :ivar usage: {node: what it used}.
-    :ivar wall_seconds: from the start of the nodes to the last answer.
+    :ivar usage: {node: resources}.
+    :ivar wall_seconds: from the start of the nodes to their last message.
     """
 
     recorder_node: RecorderNode
@@ -276,18 +249,14 @@ class _ReplayRun:
     def __init__(
         self, configuration: Configuration, progress: Callable[[int], None], stall_timeout: float, view_port: int | None
     ) -> None:
-        self._configuration, self._progress, self._stall_timeout, self._view_port = (
-            configuration,
-            progress,
-            stall_timeout,
-            view_port,
-        )
+        self._configuration, self._progress = configuration, progress
+        self._stall_timeout, self._view_port = stall_timeout, view_port
 
     def run(self, log: Path, slam_settings: list[str]) -> None:
-        """Start the nodes, listen until the end, stop them.
+        """Start the nodes, record until the end, stop them.
 
         :param slam_settings: arguments for the node slam.
-        :raises HmtSlamError: where a node dies or nothing happens any more.
+        :raises HmtSlamError: where a node ends or the run stalls.
         """
         with (
             tempfile.TemporaryDirectory(prefix="hmt_slam_replay_") as scratch,
@@ -304,7 +273,7 @@ class _ReplayRun:
 
     @contextmanager
     def _recorder_executor(self, domain: int) -> Iterator[SingleThreadedExecutor]:
-        """The recorder's node, in a context of its own: the signals stay with whoever called."""
+        """Executor of the recorder's node, in a context of its own without signal handlers."""
         with _local_discovery():
             context = Context()
             context.init(domain_id=domain)
@@ -326,7 +295,7 @@ class _ReplayRun:
     ) -> None:
         parameters = scratch / "parameters.yaml"
         parameters.write_text(ros_yaml(self._configuration), encoding="utf-8")
-        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), _DISCOVERY_RANGE: "LOCALHOST"}
         if self._view_port is not None:
             children.start("view", ["-p", f"port:={self._view_port}"], environment)
         shared = ["--params-file", str(parameters)]
@@ -342,13 +311,13 @@ class _ReplayRun:
         children.start("robot", [*shared, *settings], environment)
 
     def _record(self, executor: SingleThreadedExecutor, children: NodeProcesses) -> None:
-        heard, last = 0, time.monotonic()
+        count, last = 0, time.monotonic()
         checked = last
         while not self.recorder_node.is_complete:
             executor.spin_once(timeout_sec=_SPIN)
             now = time.monotonic()
-            if self.recorder_node.message_count > heard:
-                heard, last = self.recorder_node.message_count, now
+            if self.recorder_node.message_count > count:
+                count, last = self.recorder_node.message_count, now
             if now - checked > _SPIN:
                 checked = now
                 self._progress(len(self.recorder_node.recorder.estimates))
@@ -367,10 +336,10 @@ class _ReplayRun:
             )
 
     def _await_diagnostics(self, executor: SingleThreadedExecutor) -> None:
-        """Hear once more from every process what it cost, which each tells every second."""
-        asked, deadline = time.time_ns(), time.monotonic() + _DIAGNOSTICS_TIMEOUT
+        """Wait for diagnostics of every process from now on, with the costs of its last messages."""
+        begin, deadline = time.time_ns(), time.monotonic() + _DIAGNOSTICS_TIMEOUT
         while time.monotonic() < deadline and any(
-            self.recorder_node.diagnostics_stamps.get(name, 0) < asked for name in process_names()
+            self.recorder_node.diagnostics_stamps.get(name, 0) < begin for name in process_names()
         ):
             executor.spin_once(timeout_sec=_SPIN)
 
@@ -381,14 +350,13 @@ def _print_notice(sentence: str) -> None:
 
 @contextmanager
 def _local_discovery() -> Iterator[None]:
-    """Nodes made inside find only those on this computer."""
-    name = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-    before = os.environ.get(name)
-    os.environ[name] = "LOCALHOST"
+    """Let contexts that are made inside discover only this computer."""
+    before = os.environ.get(_DISCOVERY_RANGE)
+    os.environ[_DISCOVERY_RANGE] = "LOCALHOST"
     try:
         yield
     finally:
         if before is None:
-            del os.environ[name]
+            del os.environ[_DISCOVERY_RANGE]
         else:
-            os.environ[name] = before
+            os.environ[_DISCOVERY_RANGE] = before

@@ -1,66 +1,147 @@
-"""A simulated robot: replays a log, or drives through a world, as /scan, /odom, /tf, /tf_static and /clock.
+"""Node of a simulated robot: publishes a log or a simulated drive as /scan, /odom, /tf, /tf_static and /clock.
 
-Where `robot.drive` says so it is driven by what comes on /cmd_vel, and tells where it is on /ground_truth.
+With ``robot.drive = commands`` it follows /cmd_vel, and publishes its true pose on /ground_truth.
 """
 
 from __future__ import annotations
 
-import sys
+import math
 import time
+from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import rclpy
+from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry as OdometryMessage
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.configuration.robot import RobotParameters
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
+from hmt_slam_ros.logs.records import LogRecord
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.logs.writer import WORLD_FRAME
 from hmt_slam_ros.messages.documents import RobotStatus, encode
 from hmt_slam_ros.messages.messages import LocalEstimate, Message, TrackingReset
-from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.open_log import is_simulated, open_log
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
-from hmt_slam_ros.ros.execution import run
-from hmt_slam_ros.ros.inbox import Inbox
-from hmt_slam_ros.ros.outbox import publish_reliably
+from hmt_slam_ros.ros.message_io import Inbox, publish_reliably
 from hmt_slam_ros.ros.parameters import ConfiguredNode, declare_frame
 from hmt_slam_ros.ros.player import Player
-from hmt_slam_ros.ros.topics import CLOCK, DOCUMENTS, ODOM, ROBOT_STATUS, SCAN
-from hmt_slam_ros.ros.transforms import transform_publisher
+from hmt_slam_ros.ros.topics import (
+    CLOCK,
+    CMD_VEL,
+    DOCUMENTS,
+    GROUND_TRUTH,
+    ODOM,
+    ROBOT_STATUS,
+    SCAN,
+    transform_publisher,
+)
 from hmt_slam_ros.sensors import Odometry, Scan
 
 if TYPE_CHECKING:
-    from hmt_slam_ros.ros.driving import DrivenRobotSource
+    from hmt_slam_ros.simulation.driven_robot import DrivenRobot
 
 _ESTIMATES = DOCUMENTS[LocalEstimate]
-_CHANGEABLE = ("robot.rate", "robot.flow_control", "robot.max_unacknowledged_scans")
 _STATUS_PERIOD = 0.2  # s
-_LONGEST_WAIT = 0.1  # s
-_BURST = 20  # measurements between two looks at services and acknowledgements
-_ACKNOWLEDGEMENT_TIMEOUT = 10.0  # s without an acknowledgement before the robot complains
+_LONGEST_WAIT = 0.1
+"""Longest time between two checks of subscribers, services and acknowledgements, s."""
+_BURST = 20
+"""Measurements that are sent between two such checks."""
+_ACKNOWLEDGEMENT_TIMEOUT = 10.0
+"""Time without an acknowledgement after which that is reported, s."""
+_REPEAT_PERIOD = 10.0
+"""Time after which a warning about velocity commands is repeated, s."""
 
 PlaybackState = Literal["waiting", "playing", "paused", "ended"]
+
+
+class DrivenRobotSource:
+    """A driven robot as a log for the player: each record is simulated right after the one before it was sent.
+
+    So a command holds from the next odometry reading on, for ``driven_robot.COMMAND_TIMEOUT`` of simulated time.
+    """
+
+    def __init__(self, node: Node, name: str, settings: RobotParameters) -> None:
+        """Put the robot where the scripted drive is after ``robot.start``.
+
+        :param name: ``sim:WORLD,...``.
+        :raises HmtSlamError: for a log that is not simulated, or an unknown world.
+        """
+        # They compile kernels, which a replay does not need.
+        from hmt_slam_ros.simulation import open_simulated  # noqa: PLC0415
+        from hmt_slam_ros.simulation.driven_robot import DrivenLog, DrivenRobot  # noqa: PLC0415
+        from hmt_slam_ros.simulation.scenario import START  # noqa: PLC0415
+
+        if not is_simulated(name):
+            raise HmtSlamError(f"{name} is no simulated world: give log:=sim:WORLD, or set robot.drive to log")
+        simulated = open_simulated(name)
+        start = simulated.true_poses(np.array([START + round(NANOSECONDS * settings.start)]))[0]
+        self._robot: DrivenRobot = DrivenRobot(simulated.scenario, start)
+        self._log = DrivenLog(simulated.name, self._robot, settings.duration)
+        self.name, self.scan_count, self.duration = simulated.name, self._log.scan_count, self._log.duration
+        self._true_poses: deque[tuple[int, NDArray[np.float64]]] = deque()
+        self._node = node
+        self._ground_truth_publisher = node.create_publisher(PoseStamped, GROUND_TRUTH, topics.STREAM)
+        node.create_subscription(Twist, CMD_VEL, self._on_command, topics.NEWEST)
+
+    def records(self) -> Iterator[LogRecord]:
+        """The measurements of the robot, each simulated when it is asked for."""
+        for record in self._log.records():
+            if isinstance(record.measurement, Odometry):
+                self._true_poses.append((record.measurement.stamp, self._robot.pose))
+            yield record
+
+    @property
+    def contacts(self) -> int:
+        """Number of times that the robot touched something."""
+        return self._robot.contacts
+
+    def publish_ground_truth(self, stamp: int) -> None:
+        """Publish the true poses at the odometry readings up to a stamp, ns."""
+        while self._true_poses and self._true_poses[0][0] <= stamp:
+            pose_stamp, pose = self._true_poses.popleft()
+            header = conversions.header_message(pose_stamp, WORLD_FRAME)
+            self._ground_truth_publisher.publish(PoseStamped(header=header, pose=conversions.pose_message(pose)))
+
+    def _on_command(self, command: Twist) -> None:
+        speed, turn_rate = command.linear.x, command.angular.z
+        if not (math.isfinite(speed) and math.isfinite(turn_rate)):
+            self._node.get_logger().warning(
+                f"cmd_vel has {speed:g} m/s and {turn_rate:g} rad/s, and the robot stops: send finite velocities",
+                throttle_duration_sec=_REPEAT_PERIOD,
+            )
+            speed = turn_rate = 0.0
+        self._robot.set_velocity(speed, turn_rate)
 
 
 class RobotNode(ConfiguredNode):
     """The node ``robot``."""
 
-    def __init__(self) -> None:
-        super().__init__("robot", _CHANGEABLE)
+    changeable_parameters = ("robot.rate", "robot.flow_control", "robot.max_unacknowledged_scans")
+
+    def __init__(self, name: str) -> None:
+        """Open the log.
+
+        :raises HmtSlamError: for an invalid parameter, or a log that cannot be read.
+        """
+        super().__init__(name)
         self._settings = self.configuration.robot
-        self._odom_frame, self._base_frame = (
-            declare_frame(self, "odom", "odom"),
-            declare_frame(self, "base", "base_link"),
-        )
+        self._odom_frame = declare_frame(self, "odom", "odom")
+        self._base_frame = declare_frame(self, "base", "base_link")
         self._laser_frame = declare_frame(self, "laser", "laser")
         self.diagnostics = NodeDiagnostics(self)
         self._driven_robot: DrivenRobotSource | None = None
@@ -75,7 +156,7 @@ class RobotNode(ConfiguredNode):
         self._statuses = self.create_publisher(String, ROBOT_STATUS, topics.LATCHED)
         self._send_transforms = transform_publisher(self, "tf")
         self._send_static_transforms = transform_publisher(self, "tf_static")
-        # The past too: the first answers may come before the two nodes have found each other.
+        # With the past: the first estimates may come before the two nodes have found each other.
         self._inbox = Inbox(self, (LocalEstimate, TrackingReset), self._on_message, self.diagnostics, topics.CHAIN)
         self.create_service(SetBool, "~/pause", self._pause)
         self.create_timer(_STATUS_PERIOD, self._publish_status, clock=self.diagnostics.steady_clock)
@@ -86,9 +167,6 @@ class RobotNode(ConfiguredNode):
         if not path:
             raise HmtSlamError("no log is given: set the parameter log, such as -p log:=data/malaga_one_loop")
         if self._settings.drive == "commands":
-            # The kernels of the simulation are for those who simulate.
-            from hmt_slam_ros.ros.driving import DrivenRobotSource  # noqa: PLC0415
-
             self._driven_robot = DrivenRobotSource(self, path, self._settings)
             return self._driven_robot
         log = open_log(Path(path), start=self._settings.start, duration=self._settings.duration or None)
@@ -97,12 +175,12 @@ class RobotNode(ConfiguredNode):
         return log
 
     def on_configuration_changed(self, configuration: Configuration) -> None:
-        """Take note of another rate, window or pace."""
+        """Apply another rate or flow control."""
         super().on_configuration_changed(configuration)
         self._settings = self._player.settings = configuration.robot
 
-    def play(self) -> None:
-        """Replay the log, then stay until told to end, for those who still listen."""
+    def spin(self) -> None:
+        """Replay the log; then stay for late subscribers until the node is to end."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
         try:
@@ -114,7 +192,7 @@ class RobotNode(ConfiguredNode):
             executor.shutdown()
 
     def _step(self) -> float:
-        """Send what is due; return the seconds until there is more to do."""
+        """Send what is due; return the time until the next step, s."""
         if self._state == "waiting":
             self._await_subscribers()
             return _LONGEST_WAIT
@@ -128,33 +206,39 @@ class RobotNode(ConfiguredNode):
 
     @property
     def _is_answered(self) -> bool:
-        """Whether one of those who hear the scans answers them; a recorder or RViz does not."""
-        hear, answer = self.get_subscriptions_info_by_topic(SCAN), self.get_publishers_info_by_topic(_ESTIMATES)
-        names = [{(end.node_namespace, end.node_name) for end in ends} for ends in (hear, answer)]
-        return bool(names[0] & names[1])
+        """Whether a subscriber of the scans publishes estimates, as a recorder or RViz does not."""
+        subscribers, publishers = (
+            {(endpoint.node_namespace, endpoint.node_name) for endpoint in endpoints}
+            for endpoints in (
+                self.get_subscriptions_info_by_topic(SCAN),
+                self.get_publishers_info_by_topic(_ESTIMATES),
+            )
+        )
+        return bool(subscribers & publishers)
 
     def _await_subscribers(self) -> None:
-        """Begin when everybody who needs the first scan is there.
+        """Start to play when all subscribers are there that need the first scan.
 
-        :raises HmtSlamError: where they do not come.
+        :raises HmtSlamError: where they do not come in time.
         """
         settings = self._settings
         missing = [
             topic
-            for publisher, topic, wanted in (
+            for publisher, topic, count in (
                 (self._scans, SCAN, settings.scan_listeners),
                 (self._readings, ODOM, settings.odometry_listeners),
             )
-            if publisher.get_subscription_count() < wanted
+            if publisher.get_subscription_count() < count
         ]
         if settings.flow_control and settings.scan_listeners and not missing and not self._is_answered:
             missing = [SCAN]
         if not missing:
             self._state, self._last_progress = "playing", time.monotonic()
-            told = f"replaying {self._log.name}: {self._log.scan_count} scans"
-            self.get_logger().info(
-                told if self._driven_robot is None else f"driving through {self._log.name} by cmd_vel"
-            )
+            if self._driven_robot is None:
+                sentence = f"replaying {self._log.name}: {self._log.scan_count} scans"
+            else:
+                sentence = f"driving through {self._log.name} by cmd_vel"
+            self.get_logger().info(sentence)
             return
         if time.monotonic() - self._started_at > settings.discovery_timeout:
             name = "scan" if missing[0] == SCAN else "odometry"
@@ -167,17 +251,12 @@ class RobotNode(ConfiguredNode):
         self._last_progress = time.monotonic()
         self._clock_times.publish(ClockMessage(clock=conversions.time_message(measurement.stamp)))
         if isinstance(measurement, Scan):
-            publish_reliably(
-                self._scans, conversions.scan_message(measurement, self._announced_laser_frame(measurement))
-            )
+            frame = self._announced_laser_frame(measurement)
+            publish_reliably(self._scans, conversions.scan_message(measurement, frame))
         else:
-            joint = conversions.transform_message(
-                measurement.stamp, self._odom_frame, self._base_frame, measurement.pose
-            )
-            self._send_transforms([joint])
-            publish_reliably(
-                self._readings, conversions.odometry_message(measurement, self._odom_frame, self._base_frame)
-            )
+            frames = self._odom_frame, self._base_frame
+            self._send_transforms([conversions.transform_message(measurement.stamp, *frames, measurement.pose)])
+            publish_reliably(self._readings, conversions.odometry_message(measurement, *frames))
         self.diagnostics.sent[type(measurement).__name__] += 1
         if self._driven_robot is not None:
             self._driven_robot.publish_ground_truth(measurement.stamp)
@@ -187,14 +266,12 @@ class RobotNode(ConfiguredNode):
             self.get_logger().info(f"end of the log after {self._player.scans_sent} scans")
 
     def _announced_laser_frame(self, scan: Scan) -> str:
-        """The frame of a scan's laser; each pose of a laser on the robot is a frame, announced when it first occurs."""
+        """The frame of a scan's laser; each new pose of a laser on the robot becomes a frame, which is published."""
         key = scan.laser_pose.tobytes()
         if key not in self._laser_frames:
             number = len(self._laser_frames)
-            self._laser_frames[key] = (
-                f"{self._laser_frame}_{number}" if number else self._laser_frame,
-                scan.laser_pose,
-            )
+            frame = f"{self._laser_frame}_{number}" if number else self._laser_frame
+            self._laser_frames[key] = (frame, scan.laser_pose)
             self._send_static_transforms(
                 [
                     conversions.transform_message(scan.stamp, self._base_frame, frame, pose)
@@ -207,7 +284,7 @@ class RobotNode(ConfiguredNode):
         if isinstance(message, LocalEstimate):
             self._player.acknowledge(message.stamp)
         elif isinstance(message, TrackingReset):
-            # Scans that waited are passed over.
+            # Slam drops the scans that were waiting.
             self._player.acknowledge(self._player.stamp)
         self._last_progress = time.monotonic()
 
@@ -218,7 +295,7 @@ class RobotNode(ConfiguredNode):
         return response
 
     def _publish_status(self) -> None:
-        """Publish the status, and complain where the replay is held up."""
+        """Publish the status, and report where acknowledgements are missing."""
         player = self._player
         if self._state != "waiting":
             self._state = "ended" if player.has_ended else "paused" if player.is_paused else "playing"
@@ -242,12 +319,3 @@ class RobotNode(ConfiguredNode):
                 f"the robot waits: slam has not answered the last {self._settings.max_unacknowledged_scans} scans; "
                 "start the slam node, or set robot.flow_control to false to replay without it"
             )
-
-
-def main() -> None:
-    """Run the node."""
-    sys.exit(run(RobotNode, RobotNode.play))
-
-
-if __name__ == "__main__":
-    main()

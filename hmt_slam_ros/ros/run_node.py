@@ -1,13 +1,12 @@
-"""Run a node by its name; a process that needs no node of its own runs in a plain process node."""
+"""Run a node by its name: ``python -m hmt_slam_ros.ros.run_node slam``."""
 
 from __future__ import annotations
 
 import sys
-from importlib import import_module
 from pathlib import Path
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.process_table import node_names, node_row
+from hmt_slam_ros.process_table import node_names, node_row, resolve_class
 from hmt_slam_ros.ros.execution import FAULT, run
 
 _PREFIX = "hmt_slam_"  # of console scripts
@@ -20,22 +19,12 @@ def run_node(name: str) -> None:
     """
     if name not in node_names():
         raise HmtSlamError(f"there is no node {name!r}: give one of {', '.join(node_names())}")
-    module = node_row(name).node_module
-    if module:
-        import_module(module).main()
-    else:
-        _run_plain_node(name)
-
-
-def _run_plain_node(name: str) -> None:
-    from hmt_slam_ros.ros.map_services import spin  # noqa: PLC0415  other nodes do not need it
-    from hmt_slam_ros.ros.process_node import ProcessNode  # noqa: PLC0415
-
-    sys.exit(run(lambda: ProcessNode(name), spin))
+    node_class = resolve_class(node_row(name).node_class)
+    sys.exit(run(lambda: node_class(name), node_class.spin))
 
 
 def main() -> None:
-    """Run the node that the first argument names, else the name of the program."""
+    """Run the node that the first argument names, or the name of the program."""
     program = Path(sys.argv[0]).name.removeprefix(_PREFIX)
     name = sys.argv[1] if sys.argv[1:] and program not in node_names() else program
     try:

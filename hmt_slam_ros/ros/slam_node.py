@@ -1,8 +1,7 @@
-"""Metric SLAM as a node: scans wait for the laser's transform, and the end of the log for the last scan."""
+"""Node of metric SLAM: scans wait for the laser's transform, and the end of the log for the last scan."""
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -12,29 +11,27 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
-from std_msgs.msg import String
+from sensor_msgs.msg import LaserScan
 from std_srvs.srv import SetBool, Trigger
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.messages.documents import RobotStatus, decode
+from hmt_slam_ros.messages.documents import RobotStatus
 from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
 from hmt_slam_ros.messages.messages import ClosureDecision, EndOfLog, Keyframe, LocalEstimate, Message, PoseReset
 from hmt_slam_ros.messages.replica import FIRST_AREA
 from hmt_slam_ros.process_table import process_row
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
-from hmt_slam_ros.ros.execution import run
 from hmt_slam_ros.ros.initial_state import InitialState, declare_initial_pose, locate_in_map
-from hmt_slam_ros.ros.map_services import MapLoader, MapSaver, StaleSubscribers, declare_save_to, spin
+from hmt_slam_ros.ros.map_services import MapLoader, MapSaver, MapServicesNode, StaleSubscribers, declare_save_to
+from hmt_slam_ros.ros.message_io import subscribe_document
 from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_pose
-from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.recovery import CHECKPOINT, ControlEvent, FrameMounting, PauseChange
-from hmt_slam_ros.ros.scan_intake import ScanIntake
-from hmt_slam_ros.ros.topics import INITIAL_POSE, PARTICLES, ROBOT_STATUS
-from hmt_slam_ros.ros.transforms import LaserMountings
+from hmt_slam_ros.ros.sensor_input import LaserMountings, SensorMonitor, SensorSubscription
+from hmt_slam_ros.ros.topics import INITIAL_POSE, PARTICLES, SCAN
 from hmt_slam_ros.saved_map.folder import VERSION, FolderReader
 from hmt_slam_ros.sensors import Odometry, Scan
 
@@ -45,12 +42,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class SlamNodeState:
-    """As a value.
+    """State of the node beside its process.
 
-    :ivar area_poses: of the most probable hypothesis, in the map.
-    :ivar estimate: the last one that was said.
+    :ivar area_poses: ``map_T_area`` of the areas of the most probable hypothesis.
+    :ivar estimate: the last one that was sent.
     :ivar map_unchanged: whether the map is as it was loaded.
-    :ivar dropped_scans: scans that the node did not let the process hear.
+    :ivar dropped_scans: number of scans that the process did not get.
     """
 
     area_poses: tuple[AreaPose, ...]
@@ -59,26 +56,29 @@ class SlamNodeState:
     dropped_scans: int
 
 
+_LIVE_QUEUE = 200
+"""Scans in the queue of a live laser above which new ones are dropped; a replay never drops any."""
 _NODE_STATE = "node"
-# The last scans of a log are awaited this long, since status and scans are separate topics.
-_END_TIMEOUT = 5.0  # s
+_END_TIMEOUT = 5.0
+"""Time without scans after which the last ones of a log are no longer awaited, s."""
 
 
-class SlamNode(ProcessNode):
+class SlamNode(MapServicesNode):
     """The node ``slam``."""
 
-    process: MetricSlam
-    # What it took in is worked off while it is inactive; only scans are not listened to.
+    # While inactive it processes the scans that it has, but gets no new ones.
     is_always_listening = True
+    changeable_parameters = ("mode",)
 
-    def __init__(self) -> None:
-        super().__init__("slam", ("mode",))
+    def __init__(self, name: str) -> None:
+        """Declare the parameters."""
+        super().__init__(name)
         self._stale_subscribers = StaleSubscribers(self)
 
     def declare_own_parameters(self) -> None:
-        """Declare what slam alone has too.
+        """As any process node; also declare frames, laser pose, ``save_to`` and ``initial_pose``.
 
-        :raises HmtSlamError: for what is no pose, or a pose in no map.
+        :raises HmtSlamError: for an invalid pose, or an initial pose without a map.
         """
         super().declare_own_parameters()
         self.map_frame, self._base_frame = declare_frame(self, "map", "map"), declare_frame(self, "base", "base_link")
@@ -87,23 +87,23 @@ class SlamNode(ProcessNode):
         if self._initial_pose is not None and not self.start_from:
             raise HmtSlamError("initial_pose is set, but no map that it is a pose in: set start_from, or leave it away")
 
-    def make_process(self, beginning: InitialState) -> MetricSlam:
-        """As any process node; scans are numbered on from those of before."""
+    def make_process(self, initial_state: InitialState) -> MetricSlam:
+        """As any process node; scans are numbered on from those before."""
         row = process_row("slam")
-        state = beginning.read_part(row.name, row.state_class) or row.state_class()
-        more = max(0, beginning.previous_scans - state.processed_scans)
-        numbered_on = replace(
+        state = initial_state.read_part(row.name, row.state_class) or row.state_class()
+        offset = max(0, initial_state.previous_scans - state.processed_scans)
+        state = replace(
             state,
-            processed_scans=state.processed_scans + more,
-            first_unpublished_scan=state.first_unpublished_scan + more,
+            processed_scans=state.processed_scans + offset,
+            first_unpublished_scan=state.first_unpublished_scan + offset,
         )
-        process: MetricSlam = row.make(self.configuration, numbered_on)
+        process: MetricSlam = row.make(self.configuration, state)
         return process
 
     def configure_node(self) -> None:
-        """As any process node, and say where the robot is in the map that it begins with.
+        """As any process node; also make the services of slam, and set the initial pose.
 
-        :raises HmtSlamError: for a map that cannot be, or one that the others do not have.
+        :raises HmtSlamError: for a map that is damaged or does not match, or that the other processes lack.
         """
         self._stale_subscribers.check_gone()
         super().configure_node()
@@ -121,7 +121,7 @@ class SlamNode(ProcessNode):
         self._saver = MapSaver(self, self._deliver_held)
         self._loader = MapLoader(self, self._deliver_held)
         self._particles = self.create_publisher(PoseArray, PARTICLES, topics.STREAM)
-        self.create_subscription(String, ROBOT_STATUS, self._on_robot_status, topics.LATCHED)
+        subscribe_document(self, self.diagnostics, RobotStatus, self._on_robot_status, topics.LATCHED)
         self.create_service(Trigger, "~/relocalize", self._relocalize)
         self.create_service(SetBool, "~/pause", self._pause)
         self.create_timer(PERIOD, self._check_inputs, clock=self.diagnostics.steady_clock)
@@ -129,20 +129,20 @@ class SlamNode(ProcessNode):
         self._deliver_initial_pose()
 
     def activate_node(self) -> None:
-        """As any process node, and listen to scans; those that were missed come first where the robot kept them."""
+        """As any process node; also subscribe to scans, of which missed ones come first where the robot kept them."""
         super().activate_node()
         self._scan_intake.start()
         self.deliver_ready_scans()
 
     def deactivate_node(self) -> None:
-        """As any process node, and listen to scans no more."""
+        """As any process node; also unsubscribe from scans."""
         super().deactivate_node()
         self._scan_intake.stop()
 
     def check_clean_up(self) -> None:
-        """See whether nothing is under way.
+        """Check that no save or load is under way.
 
-        :raises HmtSlamError: amid a save, or an exchange of the map.
+        :raises HmtSlamError: where one is.
         """
         if self.is_busy:
             raise HmtSlamError("a map is being saved or loaded: clean up again after that")
@@ -152,21 +152,21 @@ class SlamNode(ProcessNode):
             )
 
     def clean_up_node(self) -> None:
-        """As any process node; from then on the others have a map that slam does not."""
+        """As any process node; the other processes then have a map that slam lacks."""
         super().clean_up_node()
         if self.process.keyframe_events > self.initial_state.events or self.reset_number:
             self._stale_subscribers.mark_current()
 
     def _adopt_map(self) -> None:
-        """What the node shows of the map that it begins with."""
-        known = self.initial_state.map
+        """Take poses and estimate from the map of the initial state."""
+        document = self.initial_state.map
         self._area_poses = {FIRST_AREA: AreaPose(FIRST_AREA, PoseGaussian(np.zeros(3), np.zeros((3, 3))))}
-        self._area_poses |= {entry.area: entry for entry in known.area_poses} if known else {}
-        self.estimate = known.last_estimate if known else None
+        self._area_poses |= {entry.area: entry for entry in document.area_poses} if document else {}
+        self.estimate = document.last_estimate if document else None
         self._is_map_unchanged = not self.process.is_mapping
 
     def on_configuration_changed(self, configuration: Configuration) -> None:
-        """Take note of another mode, from the next keyframe on."""
+        """As any process node; another mode holds from the next keyframe on."""
         super().on_configuration_changed(configuration)
         if self.is_configured:
             self.process.mode = configuration.mode
@@ -174,12 +174,12 @@ class SlamNode(ProcessNode):
 
     @property
     def unchanged_map_folder(self) -> Path | None:
-        """The folder of the map that the node began with, where nothing but localization was done since."""
+        """Folder of the loaded map where the run did not change it, else None."""
         return self.initial_state.folder if self._is_map_unchanged else None
 
     @property
     def scans(self) -> int:
-        """Scans that have a pose."""
+        """Number of scans with a pose."""
         return self.process.processed_scans
 
     @property
@@ -189,18 +189,17 @@ class SlamNode(ProcessNode):
 
     @property
     def is_blocking(self) -> bool:
-        """Whether what is heard has to wait for that."""
+        """Whether messages have to wait for that."""
         return self._saver.is_blocking or self._loader.is_blocking
 
     def reset(self, folder: str, reset_number: int = 0) -> None:
-        """As any process node; what waits was of before, and scans are numbered on."""
+        """As any process node; also drop waiting scans, and start global localization."""
         super().reset(folder, reset_number)
         self._scan_intake.discard_waiting()
         self._adopt_map()
         self._held.appendleft(PoseReset())
 
     def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        """Scans are passed over, or no more."""
         self.recovery.record_input(PauseChange(request.data))
         self._scan_intake.pause(on=request.data)
         self._scan_intake.process_skipped()
@@ -210,7 +209,7 @@ class SlamNode(ProcessNode):
         return response
 
     def _deliver_initial_pose(self) -> None:
-        """Say where the robot is in the map that the node starts from."""
+        """Set the pose in the map of the initial state."""
         if self.is_recovering:
             return
         if not self.process.is_mapping and self.initial_state.map is None:
@@ -224,47 +223,39 @@ class SlamNode(ProcessNode):
         return locate_in_map(self.process, self._area_poses, belief, self.configuration.tsbi.place_radius)
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
-        """Somebody says where the robot is; scans whose laser is not known yet were taken before."""
+        """Reset the pose; scans that wait for a transform are older, and are dropped."""
         try:
             if message.header.frame_id != self.map_frame:
                 raise HmtSlamError(
                     f"the pose is in the frame '{message.header.frame_id}', not in '{self.map_frame}': set the fixed "
                     "frame of RViz, or map_frame"
                 )
-            place = self._locate_in_map(conversions.gaussian_from_message(message.pose))
+            initial_pose = self._locate_in_map(conversions.gaussian_from_message(message.pose))
         except HmtSlamError as fault:
             self.diagnostics.warn(f"{INITIAL_POSE} is left out: {fault}")
             return
         self._scan_intake.discard_waiting()
-        self.deliver(PoseReset(place))
+        self.deliver(PoseReset(initial_pose))
 
     def deliver_ready_scans(self) -> None:
-        """Deliver the scans whose laser's place is known, and the end behind the last."""
+        """Deliver the scans whose laser's transform is known, and the end of the log after the last."""
         self._scan_intake.deliver_ready()
         self._end_log_if_complete()
 
-    def _on_robot_status(self, message: String) -> None:
-        try:
-            status = decode(message.data, RobotStatus)
-        except HmtSlamError as error:
-            self.diagnostics.fail(f"{ROBOT_STATUS}: {error}")
-            return
+    def _on_robot_status(self, status: RobotStatus) -> None:
         if status.state == "ended" and self.diagnostics.received["Scan"] != self._scans_at_end:
             self._end_status = status
             self._end_log_if_complete()
 
     def _relocalize(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """The robot may be anywhere; scans whose laser is not known yet were taken before."""
+        """Start global localization; scans that wait for a transform are older, and are dropped."""
         self._scan_intake.discard_waiting()
         self.deliver(PoseReset())
         response.success, response.message = True, "the next scan may be from anywhere"
         return response
 
     def deliver(self, message: Message) -> None:
-        """As any process node; the odometry may have been the last thing that was missing.
-
-        While the other nodes save their parts of a map, what comes is held.
-        """
+        """As any process node; messages are held while a save or load is blocking, and jumps back in time detected."""
         if self.is_blocking:
             self._held.append(message)
             return
@@ -284,12 +275,12 @@ class SlamNode(ProcessNode):
         self._loader.start_if_ready()
 
     def _deliver_held(self) -> None:
-        """Go on with what was held."""
+        """Deliver the held messages."""
         while self._held and not self.is_blocking:
             self.deliver(self._held.popleft())
 
     def replay_input(self, value: Message | ControlEvent) -> None:
-        """As any process node; scans have come by another way."""
+        """As any process node; also scans, which do not come by the inbox, and what concerns them."""
         if isinstance(value, PauseChange):
             self._scan_intake.pause(on=value.paused)
         elif isinstance(value, FrameMounting):
@@ -303,34 +294,31 @@ class SlamNode(ProcessNode):
 
     @property
     def resume_stamps(self) -> Mapping[str, int]:
-        """Slam that was killed wants all scans and all odometry since, where somebody has them."""
+        """As any process node; after a kill all scans and odometry since are wanted."""
         return self.recovery.stamps if self.is_recovering else {}
 
     @property
     def is_quiescent(self) -> bool:
-        """Whether no scan waits for its laser's place, and nothing for the other nodes."""
+        """Whether no scan waits for a transform, and nothing for a save or load."""
         return not (self._scan_intake.waiting_count or self._held or self.is_blocking or self.is_busy)
 
     def node_state(self) -> dict[str, object]:
-        """What the node knows beside its process."""
+        """State of the node beside its process."""
         return {
             _NODE_STATE: SlamNodeState(
                 tuple(self._area_poses.values()), self.estimate, self._is_map_unchanged, self._scan_intake.dropped_count
             )
         }
 
-    def restore_node_state(self, state: Path) -> None:
-        """Take it over."""
-        known = FolderReader(state, CHECKPOINT, VERSION).read(_NODE_STATE, SlamNodeState)
-        self._area_poses = {entry.area: entry for entry in known.area_poses}
-        self.estimate, self._is_map_unchanged, self._scan_intake.dropped_count = (
-            known.estimate,
-            known.map_unchanged,
-            known.dropped_scans,
-        )
+    def restore_node_state(self, folder: Path) -> None:
+        """Restore the state of the node beside its process."""
+        state = FolderReader(folder, CHECKPOINT, VERSION).read(_NODE_STATE, SlamNodeState)
+        self._area_poses = {entry.area: entry for entry in state.area_poses}
+        self.estimate, self._is_map_unchanged = state.estimate, state.map_unchanged
+        self._scan_intake.dropped_count = state.dropped_scans
 
     def poll_final_save(self) -> bool:
-        """Whether the last map is saved, or cannot be."""
+        """Whether the last save has ended."""
         return not self.is_configured or self._saver.poll_final_save()
 
     def write_map(self, writer: MapWriter) -> None:
@@ -355,47 +343,150 @@ class SlamNode(ProcessNode):
             self.deliver(EndOfLog())
 
     def _check_inputs(self) -> None:
-        """Once a second: tell what is missing, and stop waiting for scans that were lost."""
+        """Report missing inputs once a second, and stop to wait for lost scans."""
         self.diagnostics.values["waiting scans"] = self.process.queued_scans + self._scan_intake.waiting_count
         self._scan_intake.warn_if_waiting()
         if not self.is_active:
             return
         self._scan_intake.monitor.check_silence(self.diagnostics.received["Odometry"])
         if self._end_status is not None and time.monotonic() - self._scan_intake.last_scan_at > _END_TIMEOUT:
-            came = self.diagnostics.received["Scan"]
-            self.diagnostics.warn(f"the log ended, but only {came} of its {self._end_status.scans} scans came")
+            count = self.diagnostics.received["Scan"]
+            self.diagnostics.warn(f"the log ended, but only {count} of its {self._end_status.scans} scans came")
             self._end_log_if_complete(force=True)
 
-    def publish_views(self, heard: Message, said: list[Message]) -> None:
+    def publish_views(self, message: Message, outputs: list[Message]) -> None:
         """Publish the particles of the most probable hypothesis in the map, at keyframes."""
-        if isinstance(heard, ClosureDecision) and heard.global_poses:
-            self._area_poses = {area.area: area for area in heard.global_poses}
-        for message in said:
-            if isinstance(message, LocalEstimate):
-                self.estimate = message
-            if isinstance(message, Keyframe):
-                self._report_effective_samples(message)
-                self._publish_particles(message.scan.stamp)
+        if isinstance(message, ClosureDecision) and message.global_poses:
+            self._area_poses = {entry.area: entry for entry in message.global_poses}
+        for output in outputs:
+            if isinstance(output, LocalEstimate):
+                self.estimate = output
+            if isinstance(output, Keyframe):
+                self._report_effective_samples(output)
+                self._publish_particles(output.scan.stamp)
 
     def _report_effective_samples(self, keyframe: Keyframe) -> None:
         best = self.process.replica.best_hypothesis
-        for leaf in keyframe.estimates:
-            if leaf.hypothesis == best:
+        for estimate in keyframe.estimates:
+            if estimate.hypothesis == best:
                 particles = len(self.process.particles[1])
-                self.diagnostics.values["effective samples"] = f"{leaf.effective_samples:.1f} of {particles}"
+                self.diagnostics.values["effective samples"] = f"{estimate.effective_samples:.1f} of {particles}"
 
     def _publish_particles(self, stamp: int) -> None:
         area, poses = self.process.particles
         if area in self._area_poses and self._particles.get_subscription_count():
-            placed = se2.compose(self._area_poses[area].pose.mean, poses)
+            in_map = se2.compose(self._area_poses[area].pose.mean, poses)
             header = conversions.header_message(stamp, self.map_frame)
-            self._particles.publish(PoseArray(header=header, poses=[conversions.pose_message(pose) for pose in placed]))
+            self._particles.publish(PoseArray(header=header, poses=[conversions.pose_message(pose) for pose in in_map]))
 
 
-def main() -> None:
-    """Run the node."""
-    sys.exit(run(SlamNode, spin))
+class ScanIntake:
+    """Scans on their way to metric SLAM: they wait for the laser's transform, are skipped in a pause, or dropped.
 
+    :ivar monitor: checks of stamps and rates.
+    :ivar dropped_count: number of scans that the process does not get.
+    :ivar is_paused: whether scans are skipped.
+    :ivar last_scan_at: time of the last scan by the monotonic clock, s.
+    """
 
-if __name__ == "__main__":
-    main()
+    def __init__(self, node: SlamNode, mountings: LaserMountings, resume_stamp: int | None) -> None:
+        """Prepare; :meth:`start` subscribes.
+
+        :param resume_stamp: stamp of the last scan before, ns, as in :class:`SensorSubscription`.
+        """
+        self._node, self._mountings = node, mountings
+        self.monitor = SensorMonitor(node.diagnostics)
+        self.dropped_count, self.is_paused = 0, False
+        self.last_scan_at = self._waiting_since = time.monotonic()
+        self._waiting: deque[LaserScan] = deque()
+        self._skipped: LaserScan | None = None
+        self._has_warned = False
+        self._subscription = SensorSubscription(node, node.diagnostics, LaserScan, SCAN, self._on_scan, resume_stamp)
+
+    @property
+    def waiting_count(self) -> int:
+        """Number of scans that wait for the laser's transform."""
+        return len(self._waiting)
+
+    def start(self) -> None:
+        """Subscribe; what was missed since :meth:`stop` comes first, where the publisher is latched."""
+        self.last_scan_at = time.monotonic()
+        self.monitor.start()
+        self._subscription.start()
+
+    def stop(self) -> None:
+        """Unsubscribe."""
+        self._subscription.stop()
+
+    def discard_waiting(self) -> None:
+        """Drop the scans that wait for the laser's transform."""
+        self._waiting.clear()
+
+    def reset_stamp_order(self) -> None:
+        """Accept any stamp of the next scan."""
+        self.monitor.reset()
+        self._subscription.reset_order()
+
+    def pause(self, *, on: bool) -> None:
+        """Skip scans from now on, or resume."""
+        self.is_paused = on
+        self._node.diagnostics.values["paused"] = "yes, scans are passed over" if on else "no"
+
+    def process_skipped(self) -> None:
+        """After a pause, process its last scan, by which the robot is found again."""
+        skipped, self._skipped = self._skipped, None
+        if skipped is not None and not self.is_paused:
+            self._enqueue(skipped)
+
+    def count_scan(self) -> None:
+        """Count a scan that has come."""
+        self.last_scan_at = time.monotonic()
+        self.monitor.note_scan()
+        self._node.diagnostics.received["Scan"] += 1
+
+    def _on_scan(self, message: LaserScan) -> None:
+        self.count_scan()
+        if self.is_paused:
+            self._count_dropped(self._skipped is not None)
+            self._skipped = message
+            return
+        self._enqueue(message)
+
+    def _enqueue(self, message: LaserScan) -> None:
+        """Process a scan as soon as its laser's transform is known."""
+        if self._subscription.is_best_effort and self._node.process.queued_scans + self.waiting_count >= _LIVE_QUEUE:
+            self._count_dropped(1)
+            self._node.diagnostics.warn(
+                "scans come faster than they can be worked off: some are dropped, lower filter.particles"
+            )
+            return
+        if not self._waiting:
+            self._waiting_since, self._has_warned = time.monotonic(), False
+        self._waiting.append(message)
+        self._node.deliver_ready_scans()
+
+    def _count_dropped(self, count: int) -> None:
+        self.dropped_count += count
+        self._node.diagnostics.values["dropped scans"] = self.dropped_count
+
+    def deliver_ready(self) -> None:
+        """Deliver the scans whose laser's transform is known."""
+        while self._waiting:
+            scan = self._mountings.convert_scan(self._waiting[0])
+            if scan is None:
+                return
+            self._waiting.popleft()
+            self._node.deliver(scan)
+
+    def warn_if_waiting(self) -> None:
+        """Report scans that wait for long: first as a warning, then as a fault.
+
+        When many nodes start, DDS may take that long to bring latched transforms.
+        """
+        now = time.monotonic()
+        if not self._waiting or now - self._waiting_since <= 2 * PERIOD:
+            return
+        report = self._node.diagnostics.fail if self._has_warned else self._node.diagnostics.warn
+        report(self._mountings.missing_transform_text(self._waiting[0], self.waiting_count))
+        self._has_warned = True
+        self._waiting_since = now + 10 * PERIOD

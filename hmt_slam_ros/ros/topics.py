@@ -1,73 +1,57 @@
-"""The names of the topics, and every quality-of-service profile in use."""
+"""Names of topics, quality-of-service profiles, and the publishers of /tf."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+from geometry_msgs.msg import TransformStamped
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from hmt_slam_ros import process_table
-from hmt_slam_ros.process_table import topic_of
+from hmt_slam_ros.process_table import COMPANIONS, topic_of
 
-# Scans and odometry between the robot node and the processes: nothing is lost, however fast the replay runs.
-# A reader that falls behind makes the writer wait, since the history of a reliable KEEP_ALL topic is bounded (5000).
-SENSOR = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+try:
+    from tf2_msgs.msg import TFMessage as TFMessage  # noqa: PLC0414  re-exported
+except ImportError:  # PyPI does not have it
+    TFMessage = None
 
-# The same where what was sent is kept: of the robot node, and for slam that was killed and missed something.
-LATCHED_SENSOR = QoSProfile(
-    history=HistoryPolicy.KEEP_ALL,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+_KEEP_ALL, _KEEP_LAST = HistoryPolicy.KEEP_ALL, HistoryPolicy.KEEP_LAST
+_RELIABLE, _BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+_TRANSIENT = DurabilityPolicy.TRANSIENT_LOCAL
 
-# Drivers of live lasers publish best effort, which a reliable reader never hears. The nodes begin with SENSOR and
-# change over to this profile when DDS reports such a writer. The depth bridges a second of a fast laser.
-LIVE_SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+SENSOR = QoSProfile(history=_KEEP_ALL, reliability=_RELIABLE)
+"""Scans and odometry from the robot node: nothing is lost at any rate of the replay.
 
-# The chain Keyframe -> AreaEvents -> Hypotheses -> ClosureDecision and what belongs to it: who comes late catches up.
-CHAIN = QoSProfile(
-    history=HistoryPolicy.KEEP_ALL,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+DDS makes the writer wait for slow readers, since the history of a reliable KEEP_ALL topic is bounded (5000).
+"""
+LATCHED_SENSOR = QoSProfile(history=_KEEP_ALL, reliability=_RELIABLE, durability=_TRANSIENT)
+"""Scans and odometry that the writer keeps, for a slam that was killed and missed some."""
+LIVE_SENSOR = QoSProfile(history=_KEEP_LAST, depth=50, reliability=_BEST_EFFORT)
+"""Scans and odometry of live drivers, which a reliable reader never receives; one second of a fast laser.
 
-# A reader of a chain topic that has no use for the past.
-VOLATILE_CHAIN = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
-
-# Maps, graphs, statuses: the newest one, also for who comes late.
-LATCHED = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-
-# /tf_static has one latched message from each of several publishers.
-TF_STATIC = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=100,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-
-# What passes by for people and other programs: /tf, /pose, /clock, /diagnostics.
-STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)
-
-# For the page, which looks at what passes by a few times a second, and for commands to a robot: older ones are
-# replaced inside of DDS.
-NEWEST = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-# A reader of a chain topic that wants to know its past, and for which nobody waits: what is too much is lost.
-CHAIN_HISTORY = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1000,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-
+Readers start with SENSOR, and change to this profile when DDS reports such a writer.
+"""
+CHAIN = QoSProfile(history=_KEEP_ALL, reliability=_RELIABLE, durability=_TRANSIENT)
+"""Messages of keyframe events and all that belongs to them; late readers get those of the past."""
+VOLATILE_CHAIN = QoSProfile(history=_KEEP_ALL, reliability=_RELIABLE)
+"""A reader of a chain topic that does not need the past."""
+CHAIN_HISTORY = QoSProfile(history=_KEEP_LAST, depth=1000, reliability=_RELIABLE, durability=_TRANSIENT)
+"""A reader of a chain topic that wants the past, and may lose messages."""
+LATCHED = QoSProfile(history=_KEEP_LAST, depth=1, reliability=_RELIABLE, durability=_TRANSIENT)
+"""Maps, graphs and statuses: the newest message, also for late readers."""
+TF_STATIC = QoSProfile(history=_KEEP_LAST, depth=100, reliability=_RELIABLE, durability=_TRANSIENT)
+"""/tf_static, with one latched message from each publisher."""
+STREAM = QoSProfile(history=_KEEP_LAST, depth=100, reliability=_RELIABLE)
+"""Streams for people and other programs: /tf, /pose, /clock, /diagnostics."""
+NEWEST = QoSProfile(history=_KEEP_LAST, depth=1, reliability=_BEST_EFFORT)
+"""Only the newest message, for the live page and for commands to a robot."""
 
 SCAN, ODOM, CLOCK = "scan", "odom", "/clock"
 CMD_VEL, GROUND_TRUTH = "cmd_vel", "ground_truth"
-TASK_GOALS = {"explorer": "explorer/task", "pilot": "pilot/task"}
-TASK_RESULTS = {"explorer": "explorer/task_result", "pilot": "pilot/task_result"}
+_TASK_NODES = tuple(row.name for row in COMPANIONS if "Task" in row.consumes)
+TASK_GOALS = {name: f"{name}/task" for name in _TASK_NODES}
+TASK_RESULTS = {name: f"{name}/task_result" for name in _TASK_NODES}
 GOAL_POSE, PLACE = "goal_pose", topic_of("PlaceEstimate")
 KEYFRAMES, KEYFRAME_SCANS = topic_of("KeyframeHeader"), "hmt/keyframe_scans"
 SCAN_POSES = "hmt/scan_poses"
@@ -84,3 +68,15 @@ DIAGNOSTICS = "diagnostics"
 
 DOCUMENTS: dict[type, str] = {row.message_class: row.topic for row in process_table.DOCUMENTS}
 """{class of a message that travels as a document: topic}."""
+
+
+def transform_publisher(node: Node, topic: str) -> Callable[[list[TransformStamped]], None]:
+    """Function that publishes transforms on ``tf`` or ``tf_static``; without tf2_msgs it only logs a warning once."""
+    if TFMessage is None:
+        node.get_logger().warning(
+            f"tf2_msgs is not installed, so nothing is published on {topic}; scripts/test.sh builds it, and every ROS "
+            "installation has it"
+        )
+        return lambda _: None
+    publisher = node.create_publisher(TFMessage, topic, LATCHED if topic == "tf_static" else STREAM)
+    return lambda transforms: publisher.publish(TFMessage(transforms=transforms))

@@ -1,9 +1,8 @@
-"""The live page as a node: listens to what the others publish for people, and serves it to browsers."""
+"""Node of the live page: collects what the other nodes publish, and serves it to browsers."""
 
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -24,13 +23,13 @@ from visualization_msgs.msg import Marker, MarkerArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import ELLIPSE_95
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
+from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.documents import KeyframeHeader, RobotStatus, decode
 from hmt_slam_ros.messages.messages import Hypotheses
 from hmt_slam_ros.process_table import process_names, producer
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import area_from_frame, gaussian_from_message, pose_from_message, stamp_from_time
 from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
-from hmt_slam_ros.ros.execution import run
 from hmt_slam_ros.ros.topics import (
     DIAGNOSTICS,
     DOCUMENTS,
@@ -47,13 +46,14 @@ from hmt_slam_ros.view.board import Board, KeyframeHistory
 from hmt_slam_ros.view.health import SystemHealth
 from hmt_slam_ros.view.server import LOCAL, PORT, PageServer, grid_png
 
-# Between two looks at what came; what came meanwhile and is older than the newest was never taken out of DDS.
-_PERIOD = 0.2  # s
-_LONGEST_STEP = 1.0  # s
-_MOST_AT_ONCE = 2000  # messages
-# What is ready may also be a timer or a service; after so many turns without a message there is none.
+_PERIOD = 0.2
+"""Time between two updates, s; DDS keeps only the newest message of a stream meanwhile."""
+_LONGEST_STEP = 1.0
+"""Most listening time that an update counts, s; more means that the computer stood still."""
+_MAX_BATCH = 2000
+"""Most messages of one update."""
 _IDLE_TURNS = 3
-_SECOND = 1e9
+"""Turns of the executor without a message, such as timers and services, after which an update ends."""
 _ADDRESS = ParameterDescriptor(
     description="IP address that the page listens on; 127.0.0.1 for this computer alone, 0.0.0.0 for all.",
     read_only=True,
@@ -66,27 +66,32 @@ _PORT = ParameterDescriptor(
 _PUBLISHERS = {
     POSE: producer("RealTimePose"),
     HMT_POSE: producer("RealTimePose"),
-    GRAPH: "tlca",
-    MAP: "tlca",
+    GRAPH: producer("ClosureDecision"),
+    MAP: producer("ClosureDecision"),
     KEYFRAMES: producer("Keyframe"),
     DOCUMENTS[Hypotheses]: producer("Hypotheses"),
-    IS_LOCALIZED: "tsbi",
-    ENTROPY: "tsbi",
+    IS_LOCALIZED: producer("Hypotheses"),
+    ENTROPY: producer("Hypotheses"),
     DIAGNOSTICS: "every node",
 }
+"""{topic: its node} on the page."""
 
 
 class ViewNode(Node):
     """The node ``view``."""
 
-    def __init__(self) -> None:
-        super().__init__("view")
+    def __init__(self, name: str) -> None:
+        """Start the server.
+
+        :raises HmtSlamError: for an invalid address or port.
+        """
+        super().__init__(name)
         self.diagnostics = NodeDiagnostics(self)
         self.board = Board()
         self._health, self._history = SystemHealth(process_names()), KeyframeHistory(self.board)
-        self._heard_at: dict[str, float] = {}
+        self._message_times: dict[str, float] = {}
         self._message_count = 0
-        # Seconds in which this node listened: where the computer stood still, nobody fell silent.
+        # In s; it stands still with the computer, so that no topic seems silent after that.
         self._listening_time = 0.0
         self._map_subscription: Any = None
         self._server = PageServer(self.board, *self._declare_address())
@@ -107,9 +112,9 @@ class ViewNode(Node):
         self.get_logger().info(f"the page is at {self._server.url}")
 
     def _declare_address(self) -> tuple[str, int]:
-        """Address and port from the node's parameters.
+        """Declare ``address`` and ``port``, and return them.
 
-        :raises HmtSlamError: where they are something else.
+        :raises HmtSlamError: for invalid ones.
         """
         try:
             address = self.declare_parameter("address", LOCAL, _ADDRESS).value
@@ -120,22 +125,22 @@ class ViewNode(Node):
             ) from fault
         return str(address), int(port)
 
-    def _subscribe(self, kind: type, topic: str, hear: Callable[[Any], None], profile: QoSProfile) -> Any:  # noqa: ANN401
-        """Subscribe; return rclpy's subscription."""
+    def _subscribe(self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile) -> Any:  # noqa: ANN401
+        """Subscribe, and count messages; return rclpy's subscription."""
 
-        def callback(message: object) -> None:
+        def counting_callback(message: object) -> None:
             self._message_count += 1
-            self._heard_at[topic] = self._listening_time
+            self._message_times[topic] = self._listening_time
             self.diagnostics.received[topic] += 1
             try:
-                hear(message)
+                callback(message)
             except HmtSlamError as fault:
                 self.diagnostics.warn(f"{topic}: {fault}")
 
-        return self.create_subscription(kind, topic, callback, profile)
+        return self.create_subscription(kind, topic, counting_callback, profile)
 
-    def serve(self) -> None:
-        """Spin until the node is told to end, a few times a second."""
+    def spin(self) -> None:
+        """Update the page a few times a second until the node is to end."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
         try:
@@ -153,7 +158,7 @@ class ViewNode(Node):
 
     def _spin_pending(self, executor: SingleThreadedExecutor) -> None:
         idle = 0
-        for _ in range(_MOST_AT_ONCE):
+        for _ in range(_MAX_BATCH):
             before = self._message_count
             executor.spin_once(timeout_sec=0.0)
             idle = idle + 1 if self._message_count == before else 0
@@ -161,7 +166,7 @@ class ViewNode(Node):
                 return
 
     def _update_map_subscription(self) -> None:
-        """Ask for the map while somebody looks at the page, since tlca draws it only for those who ask."""
+        """Subscribe to the map while a browser shows the page, since tlca renders it only for subscribers."""
         if self.board.is_watched and self._map_subscription is None:
             self._map_subscription = self._subscribe(OccupancyGrid, MAP, self._on_map, topics.LATCHED)
         elif not self.board.is_watched and self._map_subscription is not None:
@@ -172,8 +177,9 @@ class ViewNode(Node):
         now = self._listening_time
         self.board.put("verdict", self._health.verdict(now))
         self.board.put("nodes", self._health.rows(now))
-        # Whole seconds, so that a page is not told anew five times a second.
-        ages = {topic: int(now - self._heard_at[topic]) if topic in self._heard_at else None for topic in _PUBLISHERS}
+        times = self._message_times
+        # In whole seconds, so that the page changes once a second.
+        ages = {topic: int(now - times[topic]) if topic in times else None for topic in _PUBLISHERS}
         self.board.put("topics", [{"topic": t, "from": _PUBLISHERS[t], "age": age} for t, age in ages.items()])
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
@@ -181,7 +187,7 @@ class ViewNode(Node):
         belief = gaussian_from_message(message.pose)
         ellipse, (x, y, theta) = belief.position_ellipse(), belief.mean.tolist()
         pose = {
-            "time": round(stamp_from_time(message.header.stamp) / _SECOND, 3),
+            "time": round(stamp_from_time(message.header.stamp) / NANOSECONDS, 3),
             "pose": [round(x, 3), round(y, 3), round(theta, 4)],
             "ellipse": None if is_uninformative(belief) else [round(value, 4) for value in ellipse],
             "deviation": round(ellipse.semi_major / ELLIPSE_95, 3),
@@ -196,13 +202,17 @@ class ViewNode(Node):
         groups: dict[str, dict[int, Marker]] = {}
         for marker in message.markers:
             groups.setdefault(marker.ns, {})[marker.id] = marker
-        around, between = groups.get("area_uncertainty", {}), groups.get("arc_uncertainty", {})
+        area_ellipses, arc_ellipses = groups.get("area_uncertainty", {}), groups.get("arc_uncertainty", {})
         areas = [
-            {"area": number, "at": _xy(disc.pose.position), **_uncertainty(around.get(number))}
+            {"area": number, "at": _xy(disc.pose.position), **_uncertainty(area_ellipses.get(number))}
             for number, disc in groups.get("areas", {}).items()
         ]
         arcs = [
-            {"closure": group == "closures", "ends": [_xy(p) for p in line.points], **_uncertainty(between.get(number))}
+            {
+                "closure": group == "closures",
+                "ends": [_xy(p) for p in line.points],
+                **_uncertainty(arc_ellipses.get(number)),
+            }
             for group in ("arcs", "closures")
             for number, line in groups.get(group, {}).items()
         ]
@@ -215,8 +225,8 @@ class ViewNode(Node):
     def _on_robot_status(self, message: String) -> None:
         status = decode(message.data, RobotStatus)
         self._health.robot_state = status.state
-        told = {"state": status.state, "log": status.log, "done": status.acknowledged, "scans": status.scans_in_log}
-        self.board.put("replay", told)
+        progress = {"state": status.state, "log": status.log, "done": status.acknowledged, "scans": status.scans_in_log}
+        self.board.put("replay", progress)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -236,13 +246,13 @@ class ViewNode(Node):
         self.board.put("map", {"tag": tag, "origin": origin[:2].tolist(), "size": size})
 
     def destroy_node(self) -> None:
-        """Close the page, then as any node."""
+        """Stop the server, and destroy the node."""
         self._server.close()
         super().destroy_node()
 
 
 def _uncertainty(marker: Marker | None) -> dict[str, Any]:
-    """Half axes and angle of an ellipse, and what it says."""
+    """Half axes and angle of an ellipse, and its text."""
     if marker is None:
         return {"ellipse": None, "text": "It is not known where this is in the map."}
     ellipse = [0.5 * marker.scale.x, 0.5 * marker.scale.y, float(pose_from_message(marker.pose)[2])]
@@ -251,12 +261,3 @@ def _uncertainty(marker: Marker | None) -> dict[str, Any]:
 
 def _xy(point: Any) -> list[float]:  # noqa: ANN401  a ROS point
     return [round(point.x, 3), round(point.y, 3)]
-
-
-def main() -> None:
-    """Run the node."""
-    sys.exit(run(ViewNode, ViewNode.serve))
-
-
-if __name__ == "__main__":
-    main()

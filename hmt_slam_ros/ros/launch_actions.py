@@ -1,0 +1,93 @@
+"""Actions that the launch files share: arguments, nodes, and the included mapping."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+PACKAGE = "hmt_slam_ros"
+RESPAWN = {"respawn": True, "respawn_delay": 1.0, "respawn_max_retries": 3}
+"""Options of a node that is started again where it was killed."""
+
+
+def shared_path(*parts: str) -> PathJoinSubstitution:
+    """Path of a file in the share folder of this package."""
+    return PathJoinSubstitution([FindPackageShare(PACKAGE), *parts])
+
+
+def switch(name: str, default: str, description: str) -> DeclareLaunchArgument:
+    """Argument that is true or false."""
+    return DeclareLaunchArgument(name, default_value=default, choices=["true", "false"], description=description)
+
+
+def common_arguments() -> list[DeclareLaunchArgument]:
+    """Arguments of all launch files."""
+    return [
+        DeclareLaunchArgument(
+            "params_file",
+            default_value=shared_path("config", "hmt_slam.yaml"),
+            description="YAML file with the parameters.",
+        ),
+        DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
+        switch("view", "false", "Whether the live page is served."),
+    ]
+
+
+def rate_argument() -> DeclareLaunchArgument:
+    """Argument for the speed of the robot node."""
+    return DeclareLaunchArgument("rate", default_value="1.0", description="Speed relative to real time.")
+
+
+def world_argument() -> DeclareLaunchArgument:
+    """Argument for the world of a simulated robot."""
+    return DeclareLaunchArgument("world", default_value="sim:institute,seed=3", description="A simulated world.")
+
+
+def value(name: str, kind: type) -> ParameterValue:
+    """Value of an argument as a parameter of a type."""
+    return ParameterValue(LaunchConfiguration(name), value_type=kind)
+
+
+def node(executable: str, parameters: dict[str, Any], **options: Any) -> Node:  # noqa: ANN401  of launch_ros
+    """Node of this package, with the parameter file and further parameters."""
+    return Node(
+        package=PACKAGE,
+        executable=executable,
+        namespace=LaunchConfiguration("namespace"),
+        parameters=[LaunchConfiguration("params_file"), parameters],
+        output="screen",
+        **options,
+    )
+
+
+def robot(log: str, **parameters: str) -> Node:
+    """The robot node, which publishes /clock and so runs on the computer's own clock.
+
+    :param log: name of the argument with the log or world.
+    :param parameters: further parameters of the group ``robot``.
+    """
+    own = {"log": value(log, str), "robot.rate": value("rate", float), "use_sim_time": False}
+    return node("robot", own | {f"robot.{name}": setting for name, setting in parameters.items()})
+
+
+def mapping(*passed: str, **arguments: str) -> IncludeLaunchDescription:
+    """The processes in simulated time, by the included ``mapping.launch.py``.
+
+    :param passed: names of arguments to pass on, beside the common ones.
+    :param arguments: further arguments.
+    """
+    names = (*(argument.name for argument in common_arguments()), *passed)
+    return IncludeLaunchDescription(
+        PythonLaunchDescriptionSource(shared_path("launch", "mapping.launch.py")),
+        launch_arguments={
+            "use_sim_time": "true",
+            **{name: LaunchConfiguration(name) for name in names},
+            **arguments,
+        }.items(),
+    )

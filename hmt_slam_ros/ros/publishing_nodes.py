@@ -1,0 +1,167 @@
+"""Nodes of TSBI, TLCA and RTL, which publish standard ROS messages beside those of their processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid
+from nav_msgs.srv import GetMap
+from rclpy.publisher import Publisher
+from std_msgs.msg import Bool, Float64, Float64MultiArray
+from visualization_msgs.msg import MarkerArray
+
+from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Message, RealTimePose, TrackingReset
+from hmt_slam_ros.real_time_localization.rtl import CorrectionSmoother
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.conversions import area_frame, pose_with_covariance_message, table_message, transform_message
+from hmt_slam_ros.ros.execution import set_realtime_priority
+from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
+from hmt_slam_ros.ros.parameters import declare_frame
+from hmt_slam_ros.ros.process_node import ProcessNode
+from hmt_slam_ros.ros.recovery import CHECKPOINT
+from hmt_slam_ros.ros.topics import ENTROPY, GRAPH, HMT_POSE, IS_LOCALIZED, MAP, PMF, POSE, transform_publisher
+from hmt_slam_ros.saved_map.folder import VERSION, FolderReader
+
+if TYPE_CHECKING:
+    from hmt_slam_ros.topological_inference.tsbi import Tsbi
+
+_RENDERER_STATE = "view"
+_RENDER_PERIOD = 3.0
+"""Time between two checks whether the map has to be published again, s."""
+
+
+class TsbiNode(ProcessNode):
+    """The node ``tsbi``: the distribution of Eq. (14), and whether the robot is localized."""
+
+    process: Tsbi
+
+    def configure_node(self) -> None:
+        """As any process node; also publish whether the robot is localized."""
+        super().configure_node()
+        self._pmf = self.create_publisher(Float64MultiArray, PMF, topics.LATCHED)
+        self._localized_publisher = self.create_publisher(Bool, IS_LOCALIZED, topics.LATCHED)
+        self._entropy_publisher = self.create_publisher(Float64, ENTROPY, topics.LATCHED)
+        self._publish_localization()
+
+    def publish_views(self, message: Message, outputs: list[Message]) -> None:
+        """Publish the distribution over the topological paths, Eq. (14), and whether the robot is localized."""
+        if outputs or isinstance(message, ClosureDecision | TrackingReset):
+            self._publish_localization()
+        for output in outputs:
+            if isinstance(output, Hypotheses):
+                self._pmf.publish(pmf_message(output))
+
+    def reset(self, folder: str, reset_number: int = 0) -> None:
+        """As any process node; also publish that the robot is not localized."""
+        super().reset(folder, reset_number)
+        self._publish_localization()
+
+    def _publish_localization(self) -> None:
+        status = self.process.localization
+        self._localized_publisher.publish(Bool(data=status.localized))
+        self._entropy_publisher.publish(Float64(data=status.entropy))
+        self.diagnostics.values["localized"] = "yes" if status.localized else "no, the robot may be anywhere in the map"
+        self.diagnostics.values["entropy of the area"] = f"{status.entropy:.3f} nats"
+
+
+def pmf_message(hypotheses: Hypotheses) -> Float64MultiArray:
+    """Rows of (hypothesis, area, probability) by falling probability; the last is (-1, -1, unexamined probability)."""
+    by_probability = sorted(hypotheses.hypotheses, key=lambda hypothesis: (-hypothesis.probability, hypothesis.id))
+    rows = [(hypothesis.id, hypothesis.area, hypothesis.probability) for hypothesis in by_probability]
+    return table_message("hypothesis", ("hypothesis", "area", "probability"), [*rows, (-1, -1, hypotheses.unexamined)])
+
+
+class TlcaNode(ProcessNode):
+    """The node ``tlca``: the occupancy grid, and the graph of areas and arcs."""
+
+    def declare_own_parameters(self) -> None:
+        """As any process node; also declare ``map_frame``."""
+        super().declare_own_parameters()
+        self._map_frame = declare_frame(self, "map", "map")
+
+    def configure_node(self) -> None:
+        """As any process node; also publish the map."""
+        super().configure_node()
+        self._renderer = self._make_renderer(MapRendererState.from_document(self.initial_state.map))
+        self._grids = self.create_publisher(OccupancyGrid, MAP, topics.LATCHED)
+        self._graphs = self.create_publisher(MarkerArray, GRAPH, topics.LATCHED)
+        self._published_versions = {GRAPH: 0, MAP: 0}
+        self.create_timer(_RENDER_PERIOD, self._publish_if_changed, clock=self.diagnostics.steady_clock)
+        self.create_service(GetMap, "~/get_map", self._get_map)
+
+    def _make_renderer(self, state: MapRendererState) -> MapRenderer:
+        return MapRenderer(self.configuration, self._map_frame, state)
+
+    def reset(self, folder: str, reset_number: int = 0) -> None:
+        """As any process node; also publish the new map."""
+        super().reset(folder, reset_number)
+        self._renderer = self._make_renderer(MapRendererState.from_document(self.initial_state.map))
+        self._published_versions = {GRAPH: -1, MAP: -1}
+
+    def node_state(self) -> dict[str, object]:
+        """State of the renderer."""
+        return {_RENDERER_STATE: self._renderer.state}
+
+    def restore_node_state(self, folder: Path) -> None:
+        """Restore the renderer."""
+        reader = FolderReader(folder, CHECKPOINT, VERSION)
+        self._renderer = self._make_renderer(reader.read(_RENDERER_STATE, MapRendererState))
+
+    def _get_map(self, _request: GetMap.Request, response: GetMap.Response) -> GetMap.Response:
+        """Answer with the current grid, an empty one before the first keyframe."""
+        response.map = self._renderer.occupancy_grid() or response.map
+        return response
+
+    def publish_views(self, message: Message, outputs: list[Message]) -> None:
+        """Update the map; a timer publishes it."""
+        for value in (message, *outputs):
+            self._renderer.update(value)
+
+    def _publish_if_changed(self) -> None:
+        if not self.is_active:
+            return
+        if self._is_due(GRAPH, self._graphs):
+            self._graphs.publish(self._renderer.graph_markers())
+        if self._is_due(MAP, self._grids) and (grid := self._renderer.occupancy_grid()) is not None:
+            self._grids.publish(grid)
+
+    def _is_due(self, topic: str, publisher: Publisher) -> bool:
+        """Whether the map has changed since its last publication, and the topic has subscribers."""
+        due = self._published_versions[topic] != self._renderer.version and publisher.get_subscription_count() > 0
+        if due:
+            self._published_versions[topic] = self._renderer.version
+        return due
+
+
+class RtlNode(ProcessNode):
+    """The node ``rtl``: /hmt/pose, /pose and map -> odom at the rate of the odometry."""
+
+    # Nobody waits for rtl, and dead reckoning must have no gap.
+    is_always_listening = True
+    changeable_parameters = ("rtl.publish_tf", "rtl.correction_time")
+
+    def declare_own_parameters(self) -> None:
+        """As any process node; also declare ``map_frame`` and ``odom_frame``."""
+        super().declare_own_parameters()
+        self._map_frame, self._odom_frame = declare_frame(self, "map", "map"), declare_frame(self, "odom", "odom")
+
+    def configure_node(self) -> None:
+        """As any process node; also publish poses and transforms."""
+        super().configure_node()
+        self._hmt_poses = self.create_publisher(PoseWithCovarianceStamped, HMT_POSE, topics.STREAM)
+        self._poses = self.create_publisher(PoseWithCovarianceStamped, POSE, topics.STREAM)
+        self._correction = CorrectionSmoother()
+        self._send_transforms = transform_publisher(self, "tf")
+        self.outbox.set_writer(RealTimePose, self._publish)
+        if self.configuration.rtl.realtime_priority:
+            self.diagnostics.values["real-time scheduling"] = "yes" if set_realtime_priority() else "not permitted"
+
+    def _publish(self, pose: RealTimePose) -> None:
+        self._hmt_poses.publish(pose_with_covariance_message(pose.stamp, area_frame(pose.area), pose.pose_in_area))
+        self._poses.publish(pose_with_covariance_message(pose.stamp, self._map_frame, pose.map_pose))
+        settings = self.configuration.rtl
+        if settings.publish_tf:
+            map_T_odom = self._correction.smooth(pose.stamp, pose.map_T_odom, pose.odometry, settings.correction_time)
+            self._send_transforms([transform_message(pose.stamp, self._map_frame, self._odom_frame, map_T_odom)])

@@ -1,0 +1,301 @@
+"""Nodes of the explorer and the pilot, which drive the robot on tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import String
+
+from hmt_slam_ros.compilation import report_compilation
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.messages.documents import ResetRequest, decode, encode
+from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
+from hmt_slam_ros.messages.messages import ClosureDecision, Message, PoseReset, RealTimePose
+from hmt_slam_ros.messages.replica import FIRST_AREA, GlobalPoses, Replica
+from hmt_slam_ros.messages.routing import SUBSCRIPTIONS, Process
+from hmt_slam_ros.messages.tasks import (
+    EXPLORER_TASKS,
+    PILOT_TASKS,
+    GoalPose,
+    PlaceEstimate,
+    Task,
+    TaskKind,
+    TaskResult,
+    VelocityCommand,
+    parse_task,
+)
+from hmt_slam_ros.ros import conversions, topics
+from hmt_slam_ros.ros.diagnostics import PERIOD
+from hmt_slam_ros.ros.execution import spin_until
+from hmt_slam_ros.ros.initial_state import InitialState, declare_start_from
+from hmt_slam_ros.ros.lifecycle import ManagedNode
+from hmt_slam_ros.ros.message_io import Inbox
+from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_pose
+from hmt_slam_ros.ros.sensor_input import LaserMountings
+from hmt_slam_ros.ros.topics import (
+    CMD_VEL,
+    DOCUMENTS,
+    GOAL_POSE,
+    HMT_POSE,
+    INITIAL_POSE,
+    PLACE,
+    SCAN,
+    TASK_GOALS,
+    TASK_RESULTS,
+)
+from hmt_slam_ros.sensors import Odometry
+
+_UNKNOWN_POSE = PoseGaussian.from_pose(np.zeros(3))
+_FIRST_AREA_POSE = AreaPose(FIRST_AREA, PoseGaussian.from_pose(np.zeros(3)))
+"""Pose of the first area, whose frame is the map's; known before the first closure decision."""
+_MISSING_TRANSFORMS = 20
+"""Scans without a transform after which that is reported."""
+
+
+class TaskNode(ManagedNode):
+    """A node whose process drives the robot on tasks.
+
+    :cvar task_kinds: kinds of tasks.
+    :ivar map_frame: name of the map's frame.
+    :ivar area_poses: ``map_T_area`` of the areas, from :meth:`configure_node` on.
+    """
+
+    task_kinds: Sequence[TaskKind]
+    area_poses: GlobalPoses
+
+    def __init__(self, name: str) -> None:
+        """Declare the parameters."""
+        self._name = name
+        super().__init__(name)
+
+    def declare_own_parameters(self) -> None:
+        """Declare frames, the laser's pose and ``start_from``."""
+        self.map_frame, self._base_frame = declare_frame(self, "map", "map"), declare_frame(self, "base", "base_link")
+        self._laser_pose = declare_laser_pose(self)
+        self._start_from = declare_start_from(self)
+
+    def spin(self) -> None:
+        """Run until the node is to end."""
+        self.enter_startup_states()
+        spin_until(self)
+
+    @property
+    def is_driver(self) -> bool:
+        """Whether it publishes velocity commands."""
+        raise NotImplementedError
+
+    def make_process(self, initial_state: InitialState) -> Process:
+        """The process in an initial state; also sets :attr:`area_poses`.
+
+        :raises HmtSlamError: where it cannot start from that.
+        """
+        raise NotImplementedError
+
+    def configure_node(self) -> None:
+        """Make the process, publishers and subscriptions.
+
+        :raises HmtSlamError: for a map that is damaged or does not match.
+        """
+        self._reset_number, self._scans_without_mounting = 0, 0
+        initial_state = InitialState(self, self._start_from, lost=True)
+        self._process = self.make_process(initial_state)
+        report_compilation(self.get_logger().info)
+        self._commands = self.create_publisher(Twist, CMD_VEL, topics.STREAM) if self.is_driver else None
+        self._result_publisher = self.create_publisher(String, TASK_RESULTS[self._name], topics.LATCHED)
+        self._goals = self.create_publisher(PoseStamped, GOAL_POSE, topics.STREAM)
+        self._mountings = LaserMountings(self, self._base_frame, self._laser_pose)
+        self.create_subscription(PoseWithCovarianceStamped, HMT_POSE, self._on_pose, topics.NEWEST)
+        self.create_subscription(LaserScan, SCAN, self._on_scan, topics.NEWEST)
+        self.create_subscription(String, TASK_GOALS[self._name], self._on_task, topics.STREAM)
+        self._inbox = Inbox(
+            self,
+            SUBSCRIPTIONS[self._name],
+            self.on_message,
+            self.diagnostics,
+            first_event=initial_state.events,
+            reset_number=0,
+        )
+        self.create_subscription(String, DOCUMENTS[ResetRequest], self._on_reset_request, topics.CHAIN)
+        self.create_timer(PERIOD, self._check_chain, clock=self.diagnostics.steady_clock)
+
+    def deactivate_node(self) -> None:
+        """Stop the robot."""
+        if self._commands is not None:
+            self._commands.publish(Twist())
+
+    def on_message(self, message: Message) -> None:
+        """Handle a message of the inbox."""
+        self.process_message(message)
+
+    def process_message(self, message: Message) -> None:
+        """Let the process handle a message, and publish its outputs."""
+        outputs: list[Message] = []
+        with self.diagnostics.measure(message, outputs):
+            outputs += self._process.handle(message)
+        for output in outputs:
+            self.publish_output(output)
+
+    def publish_output(self, message: Message) -> None:
+        """Publish an output of the process; a goal only where its area has a pose in the map."""
+        if isinstance(message, TaskResult):
+            self._result_publisher.publish(String(data=message.text))
+            self.get_logger().info(message.text)
+        elif isinstance(message, VelocityCommand) and self._commands is not None:
+            command = Twist()
+            command.linear.x, command.angular.z = message.speed, message.turn_rate
+            self._commands.publish(command)
+        elif isinstance(message, GoalPose) and (area := self.area_poses.get(message.area)) is not None:
+            pose = conversions.pose_message(se2.compose(area.mean, message.pose))
+            header = conversions.header_message(message.stamp, self.map_frame)
+            self._goals.publish(PoseStamped(header=header, pose=pose))
+
+    def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        try:
+            area = conversions.area_from_frame(message.header.frame_id)
+        except HmtSlamError as fault:
+            self.diagnostics.warn(f"{HMT_POSE}: {fault}")
+            return
+        stamp = conversions.stamp_from_time(message.header.stamp)
+        belief = conversions.gaussian_from_message(message.pose)
+        self.process_message(
+            RealTimePose(stamp, area, _UNKNOWN_POSE, belief, _UNKNOWN_POSE, np.zeros(3), np.zeros((3, 3)))
+        )
+
+    def _on_scan(self, message: LaserScan) -> None:
+        if not self.is_active:
+            return
+        self.diagnostics.received["Scan"] += 1
+        scan = self._mountings.convert_scan(message)
+        if scan is not None:
+            self.process_message(scan)
+            return
+        self._scans_without_mounting += 1
+        if self._scans_without_mounting == _MISSING_TRANSFORMS:
+            self.diagnostics.warn(self._mountings.missing_transform_text(message, self._scans_without_mounting))
+
+    def _on_reset_request(self, message: String) -> None:
+        """Start again with the same map as the processes; a task ends with its map.
+
+        :raises HmtSlamError: where the process cannot start from that map.
+        """
+        request = decode(message.data, ResetRequest)
+        if request.number <= self._reset_number:
+            return
+        self.process_message(Task("stop"))
+        self.deactivate_node()
+        try:
+            initial_state = InitialState(self, request.folder, lost=True)
+            self._process = self.make_process(initial_state)
+        except HmtSlamError as fault:
+            raise HmtSlamError(f"the map was exchanged, and {self._name} cannot go on: {fault}") from fault
+        self._reset_number = request.number
+        self._inbox.reset(initial_state.events, request.number)
+        self._inbox.deliver_early()
+
+    def _check_chain(self) -> None:
+        """Stop the robot where messages of the chain were lost.
+
+        :raises HmtSlamError: then, since the map stays incomplete.
+        """
+        if self._inbox.order.fault is not None:
+            self.deactivate_node()
+            raise HmtSlamError(self._inbox.order.fault)
+
+    def _on_task(self, message: String) -> None:
+        try:
+            task = parse_task(message.data, self.task_kinds)
+        except HmtSlamError as fault:
+            self.diagnostics.warn(str(fault))
+        else:
+            self.process_message(task)
+
+
+class ExplorerNode(TaskNode):
+    """The node ``explorer``: drives by cmd_vel, or publishes goal_pose for another program."""
+
+    task_kinds = EXPLORER_TASKS
+
+    @property
+    def is_driver(self) -> bool:
+        """Whether it publishes velocity commands."""
+        return self.configuration.explorer.drive == "velocities"
+
+    def make_process(self, initial_state: InitialState) -> Process:
+        """The explorer of a map, or of an unknown building."""
+        from hmt_slam_ros.exploration.explorer import Explorer  # noqa: PLC0415  takes time
+
+        document = initial_state.map
+        self.area_poses = GlobalPoses((_FIRST_AREA_POSE,) if document is None else document.area_poses)
+        explorer = Explorer(self.configuration, None if document is None else Replica.from_state(document.replica))
+        if self.configuration.explorer.explores:
+            explorer.handle(Task("explore"))
+        return explorer
+
+    def on_message(self, message: Message) -> None:
+        """Handle a message of the inbox, and update the poses of the areas."""
+        if isinstance(message, ClosureDecision) and message.global_poses:
+            self.area_poses = GlobalPoses(message.global_poses)
+        self.process_message(message)
+
+
+class PilotNode(TaskNode):
+    """The node ``pilot``: localizes by the belief over places, resets slam at doors, and drives to rooms."""
+
+    task_kinds = PILOT_TASKS
+
+    @property
+    def is_driver(self) -> bool:
+        """Whether it publishes velocity commands."""
+        return self.configuration.pilot.drives
+
+    def configure_node(self) -> None:
+        """As any task node; also publish place estimates and initial poses.
+
+        :raises HmtSlamError: where there is no map, or one without places.
+        """
+        super().configure_node()
+        self._estimates = self.create_publisher(String, PLACE, topics.LATCHED)
+        self._initial_pose_publisher = self.create_publisher(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
+        self._stamp = 0
+
+    def make_process(self, initial_state: InitialState) -> Process:
+        """The pilot of a map.
+
+        :raises HmtSlamError: where there is no map, or one without places.
+        """
+        from hmt_slam_ros.exploration.pilot import PilotProcess  # noqa: PLC0415  takes time
+
+        document = initial_state.map
+        if document is None:
+            raise HmtSlamError("the pilot goes by the places of a map, and there is none: set start_from")
+        self.area_poses = GlobalPoses(document.area_poses)
+        pilot = PilotProcess(self.configuration, document.replica)
+        self.get_logger().info(f"rooms to go to: {', '.join(pilot.rooms) or 'none'}")
+        return pilot
+
+    def on_message(self, message: Message) -> None:
+        """Handle a message of the inbox; an inactive pilot ignores odometry."""
+        if self.is_active or not isinstance(message, Odometry):
+            self.process_message(message)
+
+    def publish_output(self, message: Message) -> None:
+        """Publish an output of the pilot; a pose reset as an initial pose in the map."""
+        super().publish_output(message)
+        if isinstance(message, PlaceEstimate):
+            self._stamp = message.stamp
+            self._estimates.publish(String(data=encode(message)))
+            self.diagnostics.values["place"] = f"{message.place or 'unknown'}, {message.probability:.3f}"
+        elif isinstance(message, PoseReset) and message.initial_pose is not None:
+            self._publish_initial_pose(message.initial_pose)
+
+    def _publish_initial_pose(self, initial_pose: InitialPose) -> None:
+        pose = se2.compose(self.area_poses[initial_pose.area].mean, initial_pose.pose.mean)
+        belief = PoseGaussian(pose, initial_pose.pose.covariance)
+        self._initial_pose_publisher.publish(
+            conversions.pose_with_covariance_message(self._stamp, self.map_frame, belief)
+        )
