@@ -14,7 +14,15 @@ from importlib import import_module
 from pathlib import Path
 
 from benchmark.logs import LOGS, ROOT
-from benchmark.report import ACCURACY, VALIDATION, Report, circumstances, shown, summary, write_between_marks
+from benchmark.report import (
+    ACCURACY,
+    VALIDATION,
+    Report,
+    copy_illustrations,
+    describe_circumstances,
+    summarize_circumstances,
+    write_between_marks,
+)
 from benchmark.runs import Runner
 from benchmark.settings import Settings
 from benchmark.simulated.records import Records
@@ -81,7 +89,7 @@ _GROUPS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, write the reports, say what holds; return the exit status."""
-    options = _parser().parse_args(arguments)
+    options = make_parser().parse_args(arguments)
     try:
         reports = _measure(options)
     except HmtSlamError as fault:
@@ -93,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _measure(options: argparse.Namespace) -> list[Report]:
     if options.write_docs and (options.set or options.logs or options.training):
         raise HmtSlamError("--write-docs is for the whole measurement: leave --set and --logs away, and --training")
-    out = _folder(options)
+    out = create_report_folder(options)
     runner = Runner(out / "runs", options.jobs)
     changes, seeds = tuple(options.set), tuple(range(options.seeds))
     records = Records(options.runs or out / "runs", options.jobs)
@@ -101,25 +109,27 @@ def _measure(options: argparse.Namespace) -> list[Report]:
         options.logs, seeds, changes, out, options.write_expected, runner, records, options.training, options.minutes
     )
     reports = []
-    for kind in _kinds(options):
+    for kind in list_kinds(options):
         module = import_module(f"benchmark.{_MODULES.get(kind, kind)}")
         report: Report = getattr(module, f"measure_{kind}")(settings)
-        facts = circumstances(report.seeds, options.jobs, options.set)
+        facts = describe_circumstances(report.seeds, options.jobs, options.set)
         report.write(out, facts)
         if options.write_docs:
             document = VALIDATION if kind in _GROUPS["validation"] else ACCURACY
-            write_between_marks(document, kind, f"{summary(facts)}\n\n{report.text}{shown(report, out)}")
+            write_between_marks(
+                document, kind, f"{summarize_circumstances(facts)}\n\n{report.text}{copy_illustrations(report, out)}"
+            )
         print(f"\n# {report.title}\n\n{report.text}\n\n{out / f'{kind}.md'}", flush=True)
         reports.append(report)
     return reports
 
 
-def _kinds(options: argparse.Namespace) -> tuple[str, ...]:
-    chosen = [kind for name in options.measurements for kind in _GROUPS.get(name, (name,))]
-    return tuple(dict.fromkeys(chosen))
+def list_kinds(options: argparse.Namespace) -> tuple[str, ...]:
+    kinds = [kind for name in options.measurements for kind in _GROUPS.get(name, (name,))]
+    return tuple(dict.fromkeys(kinds))
 
 
-def _folder(options: argparse.Namespace) -> Path:
+def create_report_folder(options: argparse.Namespace) -> Path:
     """The empty folder of the report."""
     chosen: Path | None = options.out
     if chosen is None:
@@ -132,21 +142,23 @@ def _folder(options: argparse.Namespace) -> Path:
     return chosen
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     parser = OneSentenceParser(
         prog="python -m benchmark",
         description="Measurements of hmt_slam_ros on recorded and simulated logs.",
-        epilog=_told(),
+        epilog=describe_kinds(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("measurements", nargs="+", choices=(*MEASUREMENTS, *_GROUPS), metavar="KIND", help="see below")
     names = ", ".join((*LOGS, *FAMILIES, INSTITUTE, LONG, CAMPUS))
-    parser.add_argument("--logs", type=_names, default=(), metavar="A,B", help=f"of {names}")
-    parser.add_argument("--seeds", type=_count, default=0, metavar="N", help="seeds 0 to N-1; simulated: from 1000")
-    parser.add_argument("--jobs", type=_count, default=2, metavar="N", help="runs at the same time; 1 for speed")
+    parser.add_argument("--logs", type=parse_names, default=(), metavar="A,B", help=f"of {names}")
+    parser.add_argument(
+        "--seeds", type=parse_count, default=0, metavar="N", help="seeds 0 to N-1; simulated: from 1000"
+    )
+    parser.add_argument("--jobs", type=parse_count, default=2, metavar="N", help="runs at the same time; 1 for speed")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report")
     parser.add_argument("--runs", type=Path, metavar="DIR", help="keeps simulated runs and awakenings, to go on from")
-    parser.add_argument("--minutes", type=_minutes, default=60.0, metavar="M", help="how long soak runs")
+    parser.add_argument("--minutes", type=parse_minutes, default=60.0, metavar="M", help="how long soak runs")
     parser.add_argument("--training", action="store_true", help="simulated worlds of seeds 0 to N-1")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="set one parameter")
     parser.add_argument("--write-expected", action="store_true", help="put what short measures on record")
@@ -154,25 +166,25 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _told() -> str:
+def describe_kinds() -> str:
     """The kinds of measurements and their groups, one a line."""
     kinds = [f"  {name:<12} {text}" for name, text in MEASUREMENTS.items()]
     groups = [f"  {name:<12} {', '.join(kinds)}" for name, kinds in _GROUPS.items()]
     return "\n".join(["kinds:", *kinds, "", "groups of kinds:", *groups])
 
 
-def _names(text: str) -> tuple[str, ...]:
+def parse_names(text: str) -> tuple[str, ...]:
     return tuple(text.split(","))
 
 
-def _minutes(text: str) -> float:
+def parse_minutes(text: str) -> float:
     minutes = float(text)
     if not minutes >= _LEAST_MINUTES:
         raise argparse.ArgumentTypeError(f"{text} tells nothing of memory: give {_LEAST_MINUTES:g} minutes or more")
     return minutes
 
 
-def _count(text: str) -> int:
+def parse_count(text: str) -> int:
     count = int(text)
     if count < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmark.logs import LOGS, WITH_RELATIONS, MeasuredLog, opened
+from benchmark.logs import LOGS, WITH_RELATIONS, MeasuredLog, open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import Case, Run
 from benchmark.scoring import (
@@ -20,11 +20,11 @@ from benchmark.scoring import (
     WALLS_POLICY,
     SeedMeans,
     Walls,
-    errors,
     judge_walls,
     over_seeds,
     score,
-    scored,
+    score_pairs,
+    score_trajectory,
 )
 from benchmark.settings import Settings
 from hmt_slam_ros.evaluation import PairErrors, RelationErrors, StampedPoses, read_tum
@@ -76,7 +76,7 @@ def measure_accuracy(settings: Settings) -> Report:
     """Map every log with every seed, score what has relations, and look for double walls in the others."""
     seeds = settings.seeds_or(SEEDS)
     report = Report("accuracy", "Accuracy of the offline run", seeds=seeds)
-    with opened(settings.logs_or(LOGS)) as logs:
+    with open_logs(settings.logs_or(LOGS)) as logs:
         cases = [Case(log, seed, changes=settings.changes) for log in logs for seed in seeds]
         runs = settings.runner.runs(cases)
         by_log = {log: [run for run in runs if run.case.log == log] for log in logs}
@@ -92,18 +92,27 @@ def _score(report: Report, settings: Settings, by_log: dict[MeasuredLog, list[Ru
         log.name: {file: [score(run.folder, log, file) for run in runs] for file in (FINAL, ONLINE)}
         for log, runs in by_log.items()
     }
-    means = {name: {file: over_seeds(own) for file, own in of_log.items()} for name, of_log in scores.items()}
+    means = {
+        name: {file: over_seeds(scores_of_seeds) for file, scores_of_seeds in of_log.items()}
+        for name, of_log in scores.items()
+    }
     for name, of_log in means.items():
         report.requirements += accuracy_requirements(name, of_log[FINAL])
     report.body += [accuracy_table(means), POLICY]
     report.data["relations"] = {
-        name: {file: {"seeds": [asdict(s) for s in own], "mean": asdict(means[name][file])} for file, own in of.items()}
-        for name, of in scores.items()
+        name: {
+            file: {
+                "seeds": [asdict(score_of_seed) for score_of_seed in scores_of_seeds],
+                "mean": asdict(means[name][file]),
+            }
+            for file, scores_of_seeds in of_log.items()
+        }
+        for name, of_log in scores.items()
     }
     report.pictures["errors.png"] = "Mean error of every seed; the line is the bound of the mean over the seeds."
     plot_errors_by_seed(settings.out / "errors.png", scores, {name: b.translation for name, b in BOUNDS.items()})
     report.pictures["spans.png"] = "Error against the time that a relation spans, all seeds: median and 95 %."
-    pairs = {log.name: [errors(run.folder, log) for run in runs] for log, runs in by_log.items()}
+    pairs = {log.name: [score_pairs(run.folder, log) for run in runs] for log, runs in by_log.items()}
     plot_errors_by_span(settings.out / "spans.png", pairs)
 
 
@@ -147,7 +156,7 @@ def _row(name: str, file: str, mean: SeedMeans) -> list[str]:
         f"{mean.long_max:.2f}",
         f"{mean.rotation:.3f}",
         f"{100.0 * mean.matched:.1f} %",
-        str(mean.carried),
+        str(mean.extrapolated),
         str(mean.missed),
     ]
 
@@ -163,8 +172,14 @@ def _look_for_double_walls(report: Report, by_log: dict[MeasuredLog, list[Run]])
     areas = {log.name: [int(run.report["areas"]) for run in runs] for log, runs in by_log.items()}
     for name, own in walls.items():
         report.requirements += [
-            Requirement(f"{name}: torn stretches, worst seed", max(len(judged.torn) for judged in own), 0),
-            Requirement(f"{name}: seeds in which nothing is seen twice", [len(j.stretches) for j in own].count(0), 0),
+            Requirement(
+                f"{name}: torn stretches, worst seed", max(len(walls_of_seed.torn) for walls_of_seed in own), 0
+            ),
+            Requirement(
+                f"{name}: seeds in which nothing is seen twice",
+                [len(walls_of_seed.stretches) for walls_of_seed in own].count(0),
+                0,
+            ),
         ]
     report.body += [_walls_table(walls, areas, closures), WALLS_POLICY, _CLOSED]
     report.data["walls"] = {
@@ -180,10 +195,11 @@ def _walls_table(walls: dict[str, list[Walls]], areas: dict[str, list[int]], clo
             name,
             _span(areas[name]),
             _span(closures[name]),
-            _span([len(judged.stretches) for judged in own]),
-            _span([len(judged.torn) for judged in own]),
-            ", ".join(sorted({f"{stretch.begin:.0f} m" for judged in own for stretch in judged.torn})) or "nowhere",
-            f"{np.mean([judged.agreement for judged in own]):.3f}",
+            _span([len(seed_walls.stretches) for seed_walls in own]),
+            _span([len(seed_walls.torn) for seed_walls in own]),
+            ", ".join(sorted({f"{stretch.begin:.0f} m" for seed_walls in own for stretch in seed_walls.torn}))
+            or "nowhere",
+            f"{np.mean([seed_walls.agreement for seed_walls in own]):.3f}",
         ]
         for name, own in walls.items()
     ]
@@ -199,18 +215,21 @@ def measure_sessions(settings: Settings) -> Report:
     seeds = settings.seeds_or(SEEDS)
     report = Report("sessions", "A log in two sessions", seeds=seeds)
     rows: list[list[str]] = []
-    with opened(settings.logs_or(WITH_RELATIONS)) as logs:
+    with open_logs(settings.logs_or(WITH_RELATIONS)) as logs:
         for log in logs:
             scores = {
                 "in one go": [score(run.folder, log) for run in settings.runner.runs(_session_cases(log, settings))],
                 "in two sessions": [errors_of_all(run.folder, log) for run in _halves(log, settings)],
             }
-            means = {name: over_seeds(own) for name, own in scores.items()}
+            means = {name: over_seeds(errors_of_seeds) for name, errors_of_seeds in scores.items()}
             whole, halves = means.values()
             worse = halves.translation / whole.translation
             report.requirements.append(Requirement(f"{log.name}: error in two sessions / in one go", worse, WORSE))
             rows += [_session_row(log.name, name, mean) for name, mean in means.items()]
-            report.data[log.name] = {name: [asdict(one) for one in own] for name, own in scores.items()}
+            report.data[log.name] = {
+                name: [asdict(errors) for errors in errors_of_seeds]
+                for name, errors_of_seeds in scores.items()
+            }
     head = ["log", "mapped", "translation [m]", "between seeds", "worst seed", "over 60 s [m]", "its max"]
     report.body += [table([*head, "rotation [deg]", "matched"], rows), SESSIONS_POLICY]
     return report
@@ -232,7 +251,7 @@ def errors_of_all(folder: Path, log: MeasuredLog) -> RelationErrors:
     """Errors of the trajectories of all sessions in the final map of an output folder."""
     parts = [read_tum(path) for path in (*sorted((folder / EARLIER_LOGS).glob("*.tum")), folder / FINAL)]
     stamps, poses = (np.concatenate(columns) for columns in zip(*((p.stamps, p.poses) for p in parts), strict=True))
-    return scored(StampedPoses(stamps, poses), log)
+    return score_trajectory(StampedPoses(stamps, poses), log)
 
 
 def _session_row(name: str, mapped: str, mean: SeedMeans) -> list[str]:
@@ -281,16 +300,18 @@ def plot_errors_by_span(path: Path, pairs: Mapping[str, Sequence[PairErrors]]) -
     """
     figure = Figure(figsize=(5.0 * len(pairs), 4.0), layout="constrained")
     for axes, (name, own) in zip(_panels(figure, len(pairs)), pairs.items(), strict=True):
-        seconds = np.maximum(np.concatenate([errors.span[errors.is_matched] for errors in own]) * 1e-9, _SHORTEST)
+        seconds = np.maximum(
+            np.concatenate([errors.span[errors.is_matched] for errors in own]) * 1e-9, _SHORTEST
+        )
         translation = np.concatenate([errors.translation[errors.is_matched] for errors in own])
         axes.plot(seconds, translation, ".", markersize=1.5, color="0.7", rasterized=True)
         edges = np.geomspace(seconds.min(), seconds.max(), _BINS + 1)
         bins = np.clip(np.searchsorted(edges, seconds, side="right") - 1, 0, _BINS - 1)
         filled = np.flatnonzero(np.bincount(bins) >= _LEAST)
-        centres = [np.median(seconds[bins == k]) for k in filled]
+        centers = [np.median(seconds[bins == k]) for k in filled]
         for share, style in ((50, "o-"), (95, "^--")):
             heights = [np.percentile(translation[bins == k], share) for k in filled]
-            axes.plot(centres, heights, style, label=f"{share} %")
+            axes.plot(centers, heights, style, label=f"{share} %")
         axes.axvline(60.0, color="black", linewidth=0.8)
         axes.set_xscale("log")
         axes.set_yscale("log")

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from benchmark.logs import opened
+from benchmark.logs import open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
-from benchmark.simulated.records import Records, code
+from benchmark.simulated.records import Records, code_hash
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.geometry import se2
@@ -97,7 +97,7 @@ class Awakening:
 
 
 @dataclass(frozen=True, eq=False)
-class Mapped:
+class MappedLog:
     """A saved map, and what is known of a drive through it.
 
     :ivar configuration: of the runs.
@@ -122,66 +122,72 @@ def measure_awakening(settings: Settings) -> Report:
     configuration = load_configuration(PARAMETERS, list(settings.changes))
     names = settings.logs_or((*LOGS, *WORLDS))
     rows = []
-    with opened([name for name in names if name not in WORLDS]) as logs:
+    with open_logs([name for name in names if name not in WORLDS]) as logs:
         paths: dict[str, Path | str] = {name: f"{SIMULATION_PREFIX}{name},laps=2" for name in names if name in WORLDS}
         paths |= {log.name: log.path for log in logs}
         count, records = len(settings.seeds_or(STARTS)), settings.records
         for name in names:
-            for kind, found in made_starts(name, paths[name], configuration, settings.changes, count, records).items():
-                rows.append(_row(name, kind, found))
-                report.data[f"{name}, {kind}"] = [asdict(one) for one in found]
+            for kind, found in complete_starts(
+                name, paths[name], configuration, settings.changes, count, records
+            ).items():
+                rows.append(_starts_row(name, kind, found))
+                report.data[f"{name}, {kind}"] = [asdict(start) for start in found]
                 if found:
-                    report.requirements += requirements(f"{name}, map of the {kind}", found, asked=name not in ALIKE)
+                    report.requirements += requirements(
+                        f"{name}, map of the {kind}", found, is_distinguishable=name not in ALIKE
+                    )
     columns = ["log", "map of the", "starts", f"right within {FAR:g} m", "m until known, mean", "median", "most"]
     report.body += [table([*columns, "wrong", "not known"], rows), POLICY]
     return report
 
 
-def made_starts(
+def complete_starts(
     name: str, path: Path | str, configuration: Configuration, changes: Sequence[str], count: int, records: Records
 ) -> dict[str, list[Awakening]]:
     """The first starts in each map of a log, of which those are made that are not there.
 
     :param changes: by which the configuration differs from the file.
     """
-    kept = Kept(records.folder / f"awakening-{name}-{_known_by(changes)}.json")
-    kept.complete(path, configuration, count, records.jobs)
-    return kept.starts(count)
+    file = StartsFile(records.folder / f"awakening-{name}-{_fingerprint(changes)}.json")
+    file.complete(path, configuration, count, records.jobs)
+    return file.starts(count)
 
 
-def requirements(name: str, found: Sequence[Awakening], *, asked: bool) -> list[Requirement]:
+def requirements(name: str, found: Sequence[Awakening], *, is_distinguishable: bool) -> list[Requirement]:
     """What is asked for of the starts in one map.
 
-    :param asked: whether the places can be told apart.
+    :param is_distinguishable: whether the places can be told apart.
     """
-    wrong = Requirement(f"{name}: confident wrong answers", sum(one.wrong for one in found), 0)
-    share = float(np.mean([one.good for one in found]))
+    wrong = Requirement(f"{name}: confident wrong answers", sum(start.wrong for start in found), 0)
+    share = float(np.mean([start.good for start in found]))
     right = Requirement(f"{name}: right within {FAR:g} m", share, 1.0, least=RIGHT_SHARE)
-    return [right, wrong] if asked else [wrong]
+    return [right, wrong] if is_distinguishable else [wrong]
 
 
-def mapped(path: Path | str, configuration: Configuration) -> dict[str, Mapped]:
+def map_log(path: Path | str, configuration: Configuration) -> dict[str, MappedLog]:
     """The maps of a whole log and of its first half, {how it is called: that}."""
     records = list(open_log(path).records())
     scans = np.array([n for n, record in enumerate(records) if isinstance(record.measurement, Scan)])
     middle, last = len(scans) // 2, int((1.0 - _LAST) * len(scans))
-    half = _read(LockStepRun(configuration), records[: scans[middle]]).state
-    run = _read(LockStepRun(configuration, state=half), records[scans[middle] :])
+    half = _process_records(LockStepRun(configuration), records[: scans[middle]]).state
+    run = _process_records(LockStepRun(configuration, state=half), records[scans[middle] :])
     whole, result = run.state, run.finish()
     truth = result.recorder.finish(result.log_progress.stamps).trajectory
     numbers = {records[scan].measurement.stamp: n for n, scan in enumerate(scans)}
-    placed = {numbers[stamp]: pose for stamp, pose in _keyframes(half).items()}
-    known, poses = np.array(list(placed)), np.array(list(placed.values()))
-    away, nearest = cKDTree(truth[known, :2]).query(truth[:, :2])
-    in_half = se2.compose(poses[nearest], se2.between(truth[known[nearest]], truth))
-    travel = np.array(list(_travelled(truth)))
+    pose_of_scan = {numbers[stamp]: pose for stamp, pose in _keyframes(half).items()}
+    known_scans, poses = np.array(list(pose_of_scan)), np.array(list(pose_of_scan.values()))
+    distances, nearest = cKDTree(truth[known_scans, :2]).query(truth[:, :2])
+    in_half = se2.compose(poses[nearest], se2.between(truth[known_scans[nearest]], truth))
+    travel = np.array(list(path_lengths(truth)))
     ends = np.searchsorted(travel, travel + _HELD_WAY)
-    held = [n for n in range(middle, last) if (away[n : ends[n]] <= _HELD).all()]
-    easy = Mapped(configuration, records, whole, scans, truth, range(last))
-    return dict(zip(KINDS, (easy, Mapped(configuration, records, half, scans, in_half, held)), strict=True))
+    starts_in_half = [n for n in range(middle, last) if (distances[n : ends[n]] <= _HELD).all()]
+    easy = MappedLog(configuration, records, whole, scans, truth, range(last))
+    return dict(
+        zip(KINDS, (easy, MappedLog(configuration, records, half, scans, in_half, starts_in_half)), strict=True)
+    )
 
 
-def _read(run: LockStepRun, records: Sequence[LogRecord]) -> LockStepRun:
+def _process_records(run: LockStepRun, records: Sequence[LogRecord]) -> LockStepRun:
     for record in records:
         run.process_record(record)
     return run
@@ -199,7 +205,7 @@ def _keyframes(state: RunState) -> dict[int, Float64]:
     }
 
 
-def _travelled(poses: Float64) -> Iterator[float]:
+def path_lengths(poses: Float64) -> Iterator[float]:
     """Length of the path up to each pose, shape (n, 3), m."""
     total, last = 0.0, poses[0]
     for pose in poses:
@@ -209,7 +215,7 @@ def _travelled(poses: Float64) -> Iterator[float]:
         yield total
 
 
-class Kept:
+class StartsFile:
     """The starts of a log that were made, in a file, so that a measurement that was stopped goes on from there.
 
     :ivar file: of lines, each with a start and the map in which it was.
@@ -226,67 +232,70 @@ class Kept:
 
     def complete(self, path: Path | str, configuration: Configuration, count: int, jobs: int) -> None:
         """Make the starts that are not there of the first ``count`` in each map."""
-        made = {kind: len(found) for kind, found in self.starts(count).items()}
+        made = {kind: len(start) for kind, start in self.starts(count).items()}
         if min(made.values()) >= count:
             return
         self.file.parent.mkdir(parents=True, exist_ok=True)
-        for kind, log in mapped(path, configuration).items():
+        for kind, log in map_log(path, configuration).items():
             drawn = np.random.default_rng(_DRAWS).integers(0, max(1, len(log.starts)), count).tolist()
             starts = [log.starts[n] for n in drawn if log.starts]
             # Forked with the map, so that none has to load it.
-            with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork"), _begin, (log,)) as pool:
-                for found in pool.map(_awakened, starts[made[kind] :]):
+            with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork"), _set_log, (log,)) as pool:
+                for start in pool.map(_try_start, starts[made[kind] :]):
                     with self.file.open("a", encoding="utf-8") as target:
-                        target.write(json.dumps([kind, *astuple(found)]) + "\n")
+                        target.write(json.dumps([kind, *astuple(start)]) + "\n")
 
 
-def _known_by(changes: Sequence[str]) -> str:
+def _fingerprint(changes: Sequence[str]) -> str:
     """What the starts of this code, with parameters that differ, are known by."""
-    own = hashlib.sha256("\n".join([code(), *changes]).encode() + Path(__file__).read_bytes())
+    own = hashlib.sha256("\n".join([code_hash(), *changes]).encode() + Path(__file__).read_bytes())
     return own.hexdigest()[:16]
 
 
-_LOG: list[Mapped] = []
+_LOG: list[MappedLog] = []
 
 
-def _begin(log: Mapped) -> None:
+def _set_log(log: MappedLog) -> None:
     _LOG.append(log)
 
 
-def _awakened(start: int) -> Awakening:
-    return awakened(_LOG[-1], start)
+def _try_start(start: int) -> Awakening:
+    return try_start(_LOG[-1], start)
 
 
-def awakened(log: Mapped, start: int) -> Awakening:
+def try_start(log: MappedLog, start: int) -> Awakening:
     """Wake up at a scan of a drive, and go on from there."""
     run = LockStepRun(log.configuration, state=log.state)
     run.lock_step.feed(PoseReset())
     found, right, wrong = math.inf, False, False
-    travel, first = _travelled(log.truth[start:]), int(log.scans[start])
+    travel, first = path_lengths(log.truth[start:]), int(log.scans[start])
     counted, n = -_STEP, start
     for record in log.records[first:]:
         run.process_record(record)
         if not isinstance(record.measurement, Scan):
             continue
-        travelled, true = next(travel), log.truth[n]
+        traveled, true = next(travel), log.truth[n]
         n += 1
-        if travelled < counted + _STEP:
+        if traveled < counted + _STEP:
             continue
-        counted = travelled
-        now = _is_right(run, log.state.recorder.global_poses, true) if _known(run) else None
+        counted = traveled
+        now = _is_right(run, log.state.recorder.global_poses, true) if _is_localized(run) else None
         if now is not None:
-            found, right, wrong = min(found, travelled), now, wrong or not now
-        if travelled >= min(FAR, found + _ON):
+            found, right, wrong = min(found, traveled), now, wrong or not now
+        if traveled >= min(FAR, found + _ON):
             break
     return Awakening(start, found, right, wrong)
 
 
-def _known(run: LockStepRun) -> bool:
+def _is_localized(run: LockStepRun) -> bool:
     """Whether the robot is sure of its place."""
     hypotheses = run.recorder.hypotheses
     if not hypotheses:
         return False
-    return sum(leaf.probability for leaf in hypotheses[max(hypotheses)].hypotheses if not leaf.lost) >= SURE
+    return (
+        sum(hypothesis.probability for hypothesis in hypotheses[max(hypotheses)].hypotheses if not hypothesis.lost)
+        >= SURE
+    )
 
 
 def _is_right(run: LockStepRun, before: Sequence[AreaPose], true: Float64) -> bool | None:
@@ -299,19 +308,19 @@ def _is_right(run: LockStepRun, before: Sequence[AreaPose], true: Float64) -> bo
     assert isinstance(slam, MetricSlam)
     assert last is not None
     decisions = run.recorder.decisions
-    given = next(
+    global_poses = next(
         (decisions[n].global_poses for n in sorted(decisions, reverse=True) if decisions[n].global_poses), before
     )
-    area = complete_area_poses(slam.replica.maps[slam.replica.best_hypothesis], given).get(last.area)
+    area = complete_area_poses(slam.replica.maps[slam.replica.best_hypothesis], global_poses).get(last.area)
     if area is None:
         return None
-    away = se2.between(true, se2.compose(area.mean, last.pose.mean))
-    return bool(math.hypot(away[0], away[1]) <= _RIGHT and abs(away[2]) <= _RIGHT_ANGLE)
+    error = se2.between(true, se2.compose(area.mean, last.pose.mean))
+    return bool(math.hypot(error[0], error[1]) <= _RIGHT and abs(error[2]) <= _RIGHT_ANGLE)
 
 
-def _row(name: str, kind: str, found: Sequence[Awakening]) -> list[str]:
-    known = [one.found for one in found if one.right]
-    share = f"{np.mean([one.good for one in found]):.2f}" if found else "-"
-    figures = (f"{of(known):.1f}" if known else "-" for of in (np.mean, np.median, max))
-    wrong, never = sum(one.wrong for one in found), sum(math.isinf(one.found) for one in found)
-    return [name, kind, str(len(found)), share, *figures, str(wrong), str(never)]
+def _starts_row(name: str, kind: str, found: Sequence[Awakening]) -> list[str]:
+    distances = [start.found for start in found if start.right]
+    share_text = f"{np.mean([start.good for start in found]):.2f}" if found else "-"
+    figures = (f"{statistic(distances):.1f}" if distances else "-" for statistic in (np.mean, np.median, max))
+    wrong, never = sum(start.wrong for start in found), sum(math.isinf(start.found) for start in found)
+    return [name, kind, str(len(found)), share_text, *figures, str(wrong), str(never)]

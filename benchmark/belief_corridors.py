@@ -35,12 +35,12 @@ class Corridors(NamedTuple):
     """Nodes and the edges between them in one direction each."""
 
     nodes: list[Node]
-    ways: list[Edge]
+    edges_one_way: list[Edge]
 
     @property
     def edges(self) -> list[Edge]:
         """In both directions."""
-        return [edge for way in self.ways for edge in (way, way.reverse)]
+        return [edge for edge in self.edges_one_way for edge in (edge, edge.reverse)]
 
 
 def random_corridors(random: np.random.Generator, rows: int, columns: int, density: float) -> Corridors:
@@ -57,24 +57,26 @@ def random_corridors(random: np.random.Generator, rows: int, columns: int, densi
     return corridors
 
 
-def drawn_building(random: np.random.Generator, corridors: Corridors) -> Corridors:
+def draw_building(random: np.random.Generator, corridors: Corridors) -> Corridors:
     """A building that the corridors may be a map of: what stands there, and where exactly."""
     nodes = [
-        Node(float(random.random() < node.existence), _stands(random, node.north), _stands(random, node.east))
+        Node(
+            float(random.random() < node.existence), _draw_present(random, node.north), _draw_present(random, node.east)
+        )
         for node in corridors.nodes
     ]
-    ways = [
-        way._replace(
-            distance=(random.normal(way.distance[0], math.sqrt(way.distance[1])), 0.0),
-            turn=(random.normal(way.turn[0], math.sqrt(way.turn[1])), 0.0),
-            landmarks=_stands(random, way.landmarks),
+    edges_one_way = [
+        edge._replace(
+            distance=(random.normal(edge.distance[0], math.sqrt(edge.distance[1])), 0.0),
+            turn=(random.normal(edge.turn[0], math.sqrt(edge.turn[1])), 0.0),
+            landmarks=_draw_present(random, edge.landmarks),
         )
-        for way in corridors.ways
+        for edge in corridors.edges_one_way
     ]
-    return Corridors(nodes, ways)
+    return Corridors(nodes, edges_one_way)
 
 
-def _stands(random: np.random.Generator, landmarks: LandmarkSequence) -> LandmarkSequence:
+def _draw_present(random: np.random.Generator, landmarks: LandmarkSequence) -> LandmarkSequence:
     there = random.random(len(landmarks.tracks)) < landmarks.probabilities
     kept = select_landmarks(landmarks, there)
     along, forms = (random.normal(mean, np.sqrt(kept.variances[:, k])) for k, mean in enumerate(kept[1:3]))
@@ -101,18 +103,18 @@ def _hallway(
     for begin, end in zip(places[:-1].tolist(), places[1:].tolist(), strict=True):
         at = begin + _LEAST + random.exponential(_DOORS)
         while at < end - _LEAST:
-            stops.append((at, _added(corridors, _side(random, heading, _opening(random, _DOOR, (_LEFT, _RIGHT))))))
+            stops.append((at, _add_node(corridors, _side(random, heading, _opening(random, _DOOR, (_LEFT, _RIGHT))))))
             at += _LEAST + random.exponential(_DOORS)
-    stops += [(at, _added(corridors, _side(random, heading, empty_sequence()))) for at in places[[0, -1]].tolist()]
+    stops += [(at, _add_node(corridors, _side(random, heading, empty_sequence()))) for at in places[[0, -1]].tolist()]
     stops.sort()
     for (at, start), (then, end) in pairwise(stops):
         length = then - at
         distance = (length, (ROUGH * length) ** 2)
         landmarks = _corners(random, length, density)
-        corridors.ways.append(Edge(start, heading, end, heading, distance, (0.0, 0.01**2), landmarks))
+        corridors.edges_one_way.append(Edge(start, heading, end, heading, distance, (0.0, 0.01**2), landmarks))
 
 
-def _added(corridors: Corridors, node: Node) -> int:
+def _add_node(corridors: Corridors, node: Node) -> int:
     corridors.nodes.append(node)
     return len(corridors.nodes) - 1
 

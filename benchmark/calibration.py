@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.special import gammainc
 
 from benchmark.report import Report, Requirement, table
-from benchmark.settings import Settings, by_family, chosen_seeds, records_of
-from benchmark.simulated.closures import NEW, NOT_ASKED
+from benchmark.settings import Settings, chosen_seeds, group_by_family, make_records
+from benchmark.simulated.closures import NEW, NOT_EXAMINED
 from benchmark.simulated.records import Record
 
 RUNS = 300
@@ -81,44 +81,47 @@ CONSISTENCY_POLICY = (
 
 def measure_calibration(settings: Settings) -> Report:
     """Map the worlds and compare the probabilities with the truth."""
-    records = records_of(settings)
+    records = make_records(settings)
     report = Report("calibration", "Calibration of the probabilities", seeds=chosen_seeds(settings))
     events = [event for record in records for event in record["events"]]
-    by_run = [[of_hypotheses(event) for event in record["events"]] for record in records]
-    ours = [each for own in by_run for each in own]
+    by_run = [[forecast_of_hypotheses(event) for event in record["events"]] for record in records]
+    ours = [forecast for own in by_run for forecast in own]
     base = new_rate(events)
-    sayings = {
+    forecasts = {
         "live hypotheses": ours,
-        "arcs alone": [of_arcs(event) for event in events],
-        "base rate": [of_base_rate(event, base) for event in events],
+        "arcs alone": [forecast_of_arcs(event) for event in events],
+        "base rate": [forecast_of_base_rate(event, base) for event in events],
     }
-    report.requirements += _requirements(len(records), sayings)
-    bounds = interval(by_run, lambda some: of_top(some).error)
+    report.requirements += _requirements(len(records), forecasts)
+    bounds = interval(by_run, lambda some: reliability_of_top(some).error)
     report.body += [
-        _scores_table(sayings),
+        _scores_table(forecasts),
         f"The 95 % interval of the first line's error of the most probable answer is {bounds[0]:.3f} to "
         f"{bounds[1]:.3f}. New ground is a true answer of {100.0 * base:.0f} % of the questions.",
         _family_table(records),
         POLICY,
     ]
-    report.data["forecasts"] = {name: [[each.right, *each.wrong] for each in own] for name, own in sayings.items()}
+    report.data["forecasts"] = {
+        name: [[forecast.right, *forecast.wrong] for forecast in own] for name, own in forecasts.items()
+    }
     report.pictures["reliability.png"] = "Frequency against probability, with 95 % intervals; below, answers in a bin."
     plot_reliability(
-        settings.out / "reliability.png", {"most probable answer": of_top(ours), "all answers": of_each(ours)}
+        settings.out / "reliability.png",
+        {"most probable answer": reliability_of_top(ours), "all answers": reliability_of_all(ours)},
     )
     return report
 
 
-def _requirements(runs: int, sayings: dict[str, list[Forecast]]) -> list[Requirement]:
-    ours = sayings["live hypotheses"]
-    score = float(np.mean([each.brier for each in ours])) if ours else math.nan
+def _requirements(runs: int, forecasts: dict[str, list[Forecast]]) -> list[Requirement]:
+    ours = forecasts["live hypotheses"]
+    score = float(np.mean([forecast.brier for forecast in ours])) if ours else math.nan
     return [
         Requirement("runs", runs, math.inf, least=RUNS),
-        Requirement("expected calibration error, most probable answer", of_top(ours).error, LIMIT),
-        Requirement("expected calibration error, all answers", of_each(ours).error, LIMIT),
+        Requirement("expected calibration error, most probable answer", reliability_of_top(ours).error, LIMIT),
+        Requirement("expected calibration error, all answers", reliability_of_all(ours).error, LIMIT),
         *(
             Requirement(f"Brier score / that of the {name}", _ratio(score, float(np.mean([f.brier for f in own]))), 1.0)
-            for name, own in sayings.items()
+            for name, own in forecasts.items()
             if own is not ours and own
         ),
     ]
@@ -129,31 +132,35 @@ def _ratio(score: float, other: float) -> float:
     return score / other if other else (1.0 if score == 0.0 else math.inf)
 
 
-def _scores_table(sayings: dict[str, list[Forecast]]) -> str:
+def _scores_table(forecasts: dict[str, list[Forecast]]) -> str:
     head = ["forecast", "questions", "Brier", "log score [nat]", "most probable is true", "its error", "error, all"]
-    return table(head, [[name, *_cells(own)] for name, own in sayings.items()])
+    return table(head, [[name, *_forecast_cells(own)] for name, own in forecasts.items()])
 
 
 def _family_table(records: list[Record]) -> str:
     head = ["family", "runs", "questions", "Brier", "log score [nat]", "most probable is true", "its error"]
     head.append("error, all")
     rows = [
-        [family, str(len(own)), *_cells([of_hypotheses(event) for record in own for event in record["events"]])]
-        for family, own in by_family(records).items()
+        [
+            family,
+            str(len(own)),
+            *_forecast_cells([forecast_of_hypotheses(event) for record in own for event in record["events"]]),
+        ]
+        for family, own in group_by_family(records).items()
     ]
     return table(head, rows)
 
 
-def _cells(own: Sequence[Forecast]) -> list[str]:
+def _forecast_cells(own: Sequence[Forecast]) -> list[str]:
     if not own:
         return ["0", *["-"] * 5]
     return [
         str(len(own)),
-        f"{np.mean([each.brier for each in own]):.4f}",
-        f"{np.mean([each.surprise for each in own]):.3f}",
-        f"{100.0 * np.mean([each.top[1] for each in own]):.1f} %",
-        f"{of_top(own).error:.3f}",
-        f"{of_each(own).error:.3f}",
+        f"{np.mean([forecast.brier for forecast in own]):.4f}",
+        f"{np.mean([forecast.surprise for forecast in own]):.3f}",
+        f"{100.0 * np.mean([forecast.top[1] for forecast in own]):.1f} %",
+        f"{reliability_of_top(own).error:.3f}",
+        f"{reliability_of_all(own).error:.3f}",
     ]
 
 
@@ -183,12 +190,12 @@ class Forecast(NamedTuple):
         return max(self.right, *self.wrong), self.right >= max(self.wrong)
 
     @property
-    def each(self) -> list[tuple[float, bool]]:
+    def all_answers(self) -> list[tuple[float, bool]]:
         """The same of all answers, without false ones of which nothing is said."""
         return [(self.right, True), *((p, False) for p in self.wrong if p >= LEAST)]
 
 
-def forecast(answers: Sequence[tuple[int, float, bool]]) -> Forecast:
+def make_forecast(answers: Sequence[tuple[int, float, bool]]) -> Forecast:
     """From (known area, probability, whether it is right) of some answers."""
     right = sum(p for _, p, true in answers if true)
     wrong: dict[int, float] = {}
@@ -199,17 +206,17 @@ def forecast(answers: Sequence[tuple[int, float, bool]]) -> Forecast:
     return Forecast(min(1.0, right), (*wrong.values(), rest))
 
 
-def of_hypotheses(event: Record) -> Forecast:
+def forecast_of_hypotheses(event: Record) -> Forecast:
     """What the live hypotheses say."""
-    return forecast([(a["area"], a["probability"], a["right"]) for a in event["answers"]])
+    return make_forecast([(a["area"], a["probability"], a["right"]) for a in event["answers"]])
 
 
-def of_arcs(event: Record) -> Forecast:
+def forecast_of_arcs(event: Record) -> Forecast:
     """What the arcs alone say."""
-    return forecast([(a["area"], a["probability"], a["right"]) for a in event["arcs_alone"]])
+    return make_forecast([(a["area"], a["probability"], a["right"]) for a in event["arcs_alone"]])
 
 
-def of_base_rate(event: Record, new: float) -> Forecast:
+def forecast_of_base_rate(event: Record, new: float) -> Forecast:
     """What one says who knows how often new ground is true.
 
     :param new: that frequency.
@@ -217,14 +224,14 @@ def of_base_rate(event: Record, new: float) -> Forecast:
     found: list[tuple[int, float, bool]] = []
     # The answers of one hypothesis follow each other: new ground, then the known areas.
     arcs = event["arcs_alone"]
-    starts = [k for k, answer in enumerate(arcs) if answer["area"] in {NEW, NOT_ASKED}]
+    starts = [k for k, answer in enumerate(arcs) if answer["area"] in {NEW, NOT_EXAMINED}]
     for begin, end in zip(starts, [*starts[1:], len(arcs)], strict=True):
         own = arcs[begin:end]
         weight, known = sum(answer["probability"] for answer in own), len(own) - 1
         for answer in own:
             share = new if answer["area"] == NEW else (1.0 - new) / max(1, known)
             found.append((answer["area"], weight * (share if known else 1.0), answer["right"]))
-    return forecast(found)
+    return make_forecast(found)
 
 
 def new_rate(events: Sequence[Record]) -> float:
@@ -238,43 +245,43 @@ class Reliability:
     """Frequency against probability.
 
     :ivar counts: shape (BINS,), answers in each bin.
-    :ivar said: shape (BINS,), mean probability there, NaN in an empty one.
-    :ivar came: shape (BINS,), share of them that is true.
+    :ivar predicted: shape (BINS,), mean probability there, NaN in an empty one.
+    :ivar observed: shape (BINS,), share of them that is true.
     """
 
     counts: NDArray[np.int64]
-    said: NDArray[np.float64]
-    came: NDArray[np.float64]
+    predicted: NDArray[np.float64]
+    observed: NDArray[np.float64]
 
     @property
     def error(self) -> float:
         """Expected calibration error."""
         filled = self.counts > 0
-        gaps = np.abs(self.said[filled] - self.came[filled])
+        gaps = np.abs(self.predicted[filled] - self.observed[filled])
         return float(np.average(gaps, weights=self.counts[filled])) if filled.any() else math.nan
 
 
 def reliability(pairs: Sequence[tuple[float, bool]]) -> Reliability:
     """Of (probability, whether it came true)."""
-    said, came = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
-    bins = np.minimum((said * BINS).astype(np.int64), BINS - 1)
+    predicted, observed = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
+    bins = np.minimum((predicted * BINS).astype(np.int64), BINS - 1)
     counts = np.bincount(bins, minlength=BINS)
     with np.errstate(invalid="ignore"):
         return Reliability(
             counts,
-            np.bincount(bins, weights=said, minlength=BINS) / counts,
-            np.bincount(bins, weights=came, minlength=BINS) / counts,
+            np.bincount(bins, weights=predicted, minlength=BINS) / counts,
+            np.bincount(bins, weights=observed, minlength=BINS) / counts,
         )
 
 
-def of_top(forecasts: Sequence[Forecast]) -> Reliability:
+def reliability_of_top(forecasts: Sequence[Forecast]) -> Reliability:
     """Of the most probable answers."""
-    return reliability([each.top for each in forecasts])
+    return reliability([forecast.top for forecast in forecasts])
 
 
-def of_each(forecasts: Sequence[Forecast]) -> Reliability:
+def reliability_of_all(forecasts: Sequence[Forecast]) -> Reliability:
     """Of all answers."""
-    return reliability([pair for each in forecasts for pair in each.each])
+    return reliability([pair for forecast in forecasts for pair in forecast.all_answers])
 
 
 def interval(
@@ -286,14 +293,14 @@ def interval(
     values = []
     for _ in range(_DRAWS if runs else 0):
         chosen = draw.integers(len(runs), size=len(runs))
-        values.append(figure([each for k in chosen for each in runs[k]]))
+        values.append(figure([forecast for k in chosen for forecast in runs[k]]))
     low, high = np.percentile(values, [2.5, 97.5]) if values else (math.nan, math.nan)
     return float(low), float(high)
 
 
 def measure_consistency(settings: Settings) -> Report:
     """Map the worlds and compare covariances with errors."""
-    records = records_of(settings)
+    records = make_records(settings)
     report = Report("consistency", "Consistency of the covariances", seeds=chosen_seeds(settings))
     low, high = ALLOWED
     report.requirements.append(Requirement("runs", len(records), math.inf, least=CONSISTENCY_RUNS))
@@ -306,7 +313,7 @@ def measure_consistency(settings: Settings) -> Report:
         kind: {record["world"]: samples(record) for record in records} for kind, samples in KINDS.items()
     }
     report.pictures["nees.png"] = "Share of errors below a NEES; the line is chi-square with 3 degrees of freedom."
-    pooled = {kind: [each for record in records for each in KINDS[kind](record)] for kind in _REQUIRED}
+    pooled = {kind: [forecast for record in records for forecast in KINDS[kind](record)] for kind in _REQUIRED}
     plot_nees(settings.out / "nees.png", pooled)
     return report
 
@@ -322,9 +329,9 @@ def mean_nees(records: Sequence[Record], samples: _Samples) -> float:
     return float(np.mean(means)) if means else math.nan
 
 
-def covered(records: Sequence[Record], samples: _Samples) -> float:
+def coverage(records: Sequence[Record], samples: _Samples) -> float:
     """Share of all errors within the 95 % ellipsoid."""
-    pooled = [each <= COVERED for record in records for each in samples(record)]
+    pooled = [forecast <= COVERED for record in records for forecast in samples(record)]
     return float(np.mean(pooled)) if pooled else math.nan
 
 
@@ -335,15 +342,15 @@ def _nees_table(records: list[Record]) -> str:
         if means := run_means(records, samples):
             count = sum(len(samples(record)) for record in records)
             figures = [f"{value:.2f}" for value in (np.mean(means), np.median(means), max(means))]
-            rows.append([kind, str(len(means)), str(count), *figures, f"{100.0 * covered(records, samples):.1f} %"])
+            rows.append([kind, str(len(means)), str(count), *figures, f"{100.0 * coverage(records, samples):.1f} %"])
     return table(head, rows)
 
 
 def _nees_by_family(records: list[Record]) -> str:
     head = ["family", *(word for kind in _REQUIRED for word in (f"NEES of {kind}", "within 95 %"))]
     rows = []
-    for family, own in by_family(records).items():
-        pairs = [(mean_nees(own, KINDS[kind]), covered(own, KINDS[kind])) for kind in _REQUIRED]
+    for family, own in group_by_family(records).items():
+        pairs = [(mean_nees(own, KINDS[kind]), coverage(own, KINDS[kind])) for kind in _REQUIRED]
         rows.append([family, *(cell for mean, share in pairs for cell in (f"{mean:.2f}", f"{100.0 * share:.1f} %"))])
     return table(head, rows)
 
@@ -358,14 +365,14 @@ def plot_reliability(path: Path, curves: Mapping[str, Reliability]) -> None:
     for column, (name, curve) in enumerate(curves.items()):
         upper, lower = grid[0][column], grid[1][column]
         filled = curve.counts > 0
-        said, came, counts = curve.said[filled], curve.came[filled], curve.counts[filled]
-        low, high = _wilson(came, counts)
+        predicted, observed, counts = curve.predicted[filled], curve.observed[filled], curve.counts[filled]
+        low, high = wilson_interval(observed, counts)
         upper.plot([0.0, 1.0], [0.0, 1.0], color="black", linewidth=0.8)
-        bars = np.maximum(0.0, np.stack((came - low, high - came)))
-        upper.errorbar(said, came, bars, fmt="o-", capsize=3)
+        bars = np.maximum(0.0, np.stack((observed - low, high - observed)))
+        upper.errorbar(predicted, observed, bars, fmt="o-", capsize=3)
         upper.set_title(f"{name}: expected error {curve.error:.3f}")
         upper.set_ylabel("share that is true")
-        lower.bar(said, counts, width=0.04)
+        lower.bar(predicted, counts, width=0.04)
         lower.set_yscale("log")
         lower.set_xlim(upper.get_xlim())
         lower.set_xlabel("probability")
@@ -373,7 +380,9 @@ def plot_reliability(path: Path, curves: Mapping[str, Reliability]) -> None:
     figure.savefig(path, dpi=_DPI)
 
 
-def _wilson(shares: NDArray[np.float64], counts: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def wilson_interval(
+    shares: NDArray[np.float64], counts: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The 95 % intervals of some shares of so many."""
     z2 = 1.96**2
     middle = (shares + z2 / (2.0 * counts)) / (1.0 + z2 / counts)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmark.one_drive import OneDrive
+from benchmark.one_drive import JoinedVisits
 from benchmark.report import Report, Requirement, table
 from benchmark.settings import Settings
 from hmt_slam_ros.configuration import Configuration
@@ -40,7 +40,7 @@ SEEDS, FIRST_SEED, RETURNS = 3, 1000, 3
 SIZE, RATE = 0.7, 3.0
 """Of the buildings, as a factor on lengths, and scans a second: a visit takes seconds then."""
 
-RECALL, KEPT, GHOSTS, NOBODY, ERROR, GROWTH = 0.8, 0.98, 0.1, 0.002, 0.1, 0.05
+RECALL, KEPT, GHOSTS, UNEXPLAINED, ERROR, GROWTH = 0.8, 0.98, 0.1, 0.002, 0.1, 0.05
 """Least shares of what is new and of what stays, largest of what is gone and of what nothing explains, m, growth."""
 
 LOCALIZED = 0.1
@@ -87,7 +87,7 @@ class Visit:
     :ivar error: of the second visit's poses, mean, m.
     :ivar worst: largest of them, m.
     :ivar keyframes: of the map after each of the two.
-    :ivar metres: of new surface, and of surface that is gone, at 0.05 m each.
+    :ivar lengths: of new surface, and of surface that is gone, at 0.05 m each.
     """
 
     new: float
@@ -98,10 +98,10 @@ class Visit:
     error: float
     worst: float
     keyframes: tuple[int, int]
-    metres: tuple[float, float]
+    lengths: tuple[float, float]
 
 
-class Localized(NamedTuple):
+class LocalizationVisit(NamedTuple):
     """A second visit in mode localization.
 
     :ivar same: whether the map is as it was.
@@ -115,7 +115,7 @@ class Localized(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Mapped:
+class MapAfterVisit:
     """A building after a visit.
 
     :ivar recording: the map at its best.
@@ -140,92 +140,98 @@ def measure_changes(settings: Settings) -> Report:
     report = Report("changes", "A world that changes", seeds=seeds)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(settings.runner.jobs, context) as pool:
-        visits = {name: list(pool.map(partial(visited_twice, world), seeds)) for name, world in WORLDS.items()}
-        sizes = {name: pool.submit(visited_often, world, seeds[0]) for name, world in WORLDS.items()}
-        stayed = {name: list(pool.map(partial(localized, world), seeds)) for name, world in WORLDS.items()}
+        visits = {name: list(pool.map(partial(visit_twice, world), seeds)) for name, world in WORLDS.items()}
+        sizes = {name: pool.submit(visit_often, world, seeds[0]) for name, world in WORLDS.items()}
+        localized = {name: list(pool.map(partial(localize_again, world), seeds)) for name, world in WORLDS.items()}
     rows = []
     for name, found in visits.items():
-        grown = sizes[name].result()
-        report.requirements += requirements(name, found, grown, stayed[name])
-        own = [one._asdict() for one in stayed[name]]
-        report.data[name] = {"visits": [asdict(one) for one in found], "keyframes": grown, "localization": own}
-        rows += [_row(f"{name}, {seed}", one) for seed, one in zip(seeds, found, strict=True)]
-        report.body.append(f"{name}, nothing changes: {', '.join(map(str, grown))} keyframes after the visits.")
-    report.body += [_told(name, seeds, own) for name, own in stayed.items()]
+        sizes_of_world = sizes[name].result()
+        report.requirements += requirements(name, found, sizes_of_world, localized[name])
+        scores = [visit._asdict() for visit in localized[name]]
+        report.data[name] = {
+            "visits": [asdict(visit) for visit in found],
+            "keyframes": sizes_of_world,
+            "localization": scores,
+        }
+        rows += [_visit_row(f"{name}, {seed}", visit) for seed, visit in zip(seeds, found, strict=True)]
+        report.body.append(
+            f"{name}, nothing changes: {', '.join(map(str, sizes_of_world))} keyframes after the visits."
+        )
+    report.body += [_describe_localization(name, seeds, scores) for name, scores in localized.items()]
     head = ["world, seed", "new [m]", "in the map", "gone [m]", "ghosts", "kept", "unexplained before", "after"]
     report.body = [table([*head, "error [m]", "worst [m]", "keyframes"], rows), *report.body, POLICY]
     return report
 
 
 def requirements(
-    name: str, found: Sequence[Visit], sizes: Sequence[int], stayed: Sequence[Localized]
+    name: str, found: Sequence[Visit], sizes: Sequence[int], localized: Sequence[LocalizationVisit]
 ) -> list[Requirement]:
     """What is asked for of a world.
 
     :param sizes: keyframes after each visit in which nothing changed.
-    :param stayed: second visits in mode localization.
+    :param localized: second visits in mode localization.
     """
 
     def mean(values: Sequence[float]) -> float:
         return float(np.mean(values))
 
     return [
-        Requirement(f"{name}: new surfaces in the map", mean([one.new for one in found]), 1.0, least=RECALL),
-        Requirement(f"{name}: surfaces that stay, kept", mean([one.kept for one in found]), 1.0, least=KEPT),
-        Requirement(f"{name}: ghosts of what is gone", mean([one.gone for one in found]), GHOSTS),
-        Requirement(f"{name}: unexplained cells, mapping", mean([one.before for one in found]), NOBODY),
-        Requirement(f"{name}: unexplained cells, lifelong", mean([one.after for one in found]), NOBODY),
-        Requirement(f"{name}: worst error of the second visit", max(one.worst for one in found), ERROR, "m"),
+        Requirement(f"{name}: new surfaces in the map", mean([visit.new for visit in found]), 1.0, least=RECALL),
+        Requirement(f"{name}: surfaces that stay, kept", mean([visit.kept for visit in found]), 1.0, least=KEPT),
+        Requirement(f"{name}: ghosts of what is gone", mean([visit.gone for visit in found]), GHOSTS),
+        Requirement(f"{name}: unexplained cells, mapping", mean([visit.before for visit in found]), UNEXPLAINED),
+        Requirement(f"{name}: unexplained cells, lifelong", mean([visit.after for visit in found]), UNEXPLAINED),
+        Requirement(f"{name}: worst error of the second visit", max(visit.worst for visit in found), ERROR, "m"),
         Requirement(f"{name}: growth where nothing changes", sizes[-1] / sizes[1] - 1.0, GROWTH),
-        Requirement(f"{name}: maps that localization changed", float(sum(not one.same for one in stayed)), 0.0),
-        Requirement(f"{name}: error of localization, mean", mean([one.error for one in stayed]), LOCALIZED, "m"),
-        Requirement(f"{name}: worst error of localization", max(one.worst for one in stayed), ERROR, "m"),
+        Requirement(f"{name}: maps that localization changed", float(sum(not visit.same for visit in localized)), 0.0),
+        Requirement(f"{name}: error of localization, mean", mean([visit.error for visit in localized]), LOCALIZED, "m"),
+        Requirement(f"{name}: worst error of localization", max(visit.worst for visit in localized), ERROR, "m"),
     ]
 
 
-def visited_twice(world: str, seed: int, size: float = SIZE, rate: float = RATE) -> Visit:
+def visit_twice(world: str, seed: int, size: float = SIZE, rate: float = RATE) -> Visit:
     """Map a building, let it change, and visit it again.
 
     :param size: of the building.
     :param rate: scans a second.
     """
-    logs = [_visit(world, seed, number, changed=0.5, size=size, rate=rate) for number in (1, 2)]
-    first = mapped(logs[:1], "mapping")
-    second = mapped(logs, "lifelong", first)
+    logs = [_simulate_visit(world, seed, number, changed=0.5, size=size, rate=rate) for number in (1, 2)]
+    first = map_visits(logs[:1], "mapping")
+    second = map_visits(logs, "lifelong", first)
     surfaces = [Surfaces.of(log) for log in logs]
-    frames = [_frame(one.recording, logs[0]) for one in (first, second)]
-    images = [one.image for one in (first, second)]
-    judgement = judged(images, frames, surfaces)
+    frames = [_frame(after.recording, logs[0]) for after in (first, second)]
+    images = [after.image for after in (first, second)]
+    scores = score_changes(images, frames, surfaces)
     return Visit(
-        judgement.new,
-        judgement.gone,
-        judgement.kept,
-        unexplained(images[0], frames[0], surfaces[0].walls),
-        unexplained(images[1], frames[1], np.concatenate((surfaces[1].walls, judgement.hidden))),
+        scores.new,
+        scores.gone,
+        scores.kept,
+        unexplained_share(images[0], frames[0], surfaces[0].walls),
+        unexplained_share(images[1], frames[1], np.concatenate((surfaces[1].walls, scores.hidden))),
         *_errors(second.recording, logs),
         (first.keyframes, second.keyframes),
-        judgement.metres,
+        scores.lengths,
     )
 
 
-def visited_often(world: str, seed: int, size: float = SIZE, rate: float = RATE, returns: int = RETURNS) -> list[int]:
+def visit_often(world: str, seed: int, size: float = SIZE, rate: float = RATE, returns: int = RETURNS) -> list[int]:
     """Keyframes of a building's map after each visit, where nothing changes."""
     found: list[int] = []
     logs: list[SimulatedLog] = []
-    after: Mapped | None = None
+    after: MapAfterVisit | None = None
     for number in range(1, returns + 2):
-        logs.append(_visit(world, seed, number, changed=0.0, size=size, rate=rate))
-        after = mapped(logs, "mapping" if after is None else "lifelong", after)
+        logs.append(_simulate_visit(world, seed, number, changed=0.0, size=size, rate=rate))
+        after = map_visits(logs, "mapping" if after is None else "lifelong", after)
         found.append(after.keyframes)
     return found
 
 
-def localized(world: str, seed: int, size: float = SIZE, rate: float = RATE) -> Localized:
+def localize_again(world: str, seed: int, size: float = SIZE, rate: float = RATE) -> LocalizationVisit:
     """A second visit in mode localization, in a world that changes."""
-    logs = [_visit(world, seed, number, changed=0.5, size=size, rate=rate) for number in (1, 2)]
-    first = mapped(logs[:1], "mapping")
-    second = mapped(logs, "localization", first)
-    return Localized(_same(first.state, second.state), *_errors(second.recording, logs))
+    logs = [_simulate_visit(world, seed, number, changed=0.5, size=size, rate=rate) for number in (1, 2)]
+    first = map_visits(logs[:1], "mapping")
+    second = map_visits(logs, "localization", first)
+    return LocalizationVisit(_is_same_map(first.state, second.state), *_errors(second.recording, logs))
 
 
 def _errors(recording: Recording, logs: Sequence[SimulatedLog]) -> tuple[float, float]:
@@ -235,18 +241,18 @@ def _errors(recording: Recording, logs: Sequence[SimulatedLog]) -> tuple[float, 
     return float(errors.mean()), float(errors.max())
 
 
-def mapped(visits: Sequence[SimulatedLog], mode: str, before: Mapped | None = None) -> Mapped:
+def map_visits(visits: Sequence[SimulatedLog], mode: str, before: MapAfterVisit | None = None) -> MapAfterVisit:
     """The map after the last of some visits.
 
     :param before: after the one before it.
     """
     stays = visits[0].scenario.settings.people > 0
-    log: Log = OneDrive(visits) if stays else visits[-1]
+    log: Log = JoinedVisits(visits) if stays else visits[-1]
     configuration = replace(Configuration(), mode=mode)
     run = LockStepRun(configuration, state=None if before is None else before.state)
     records = run.unread_records(log)
     if before is not None and not stays:
-        run.lock_step.feed(PoseReset(_begin(before.recording)))
+        run.lock_step.feed(PoseReset(_initial_pose(before.recording)))
     for record in records:
         run.process_record(record)
     state = run.state
@@ -256,10 +262,10 @@ def mapped(visits: Sequence[SimulatedLog], mode: str, before: Mapped | None = No
     placed = keyframe_poses(recording.hybrid_map, recording.area_poses)
     scans, settings = [recording.replica.scans[k] for k in placed], configuration.local_map
     image = occupancy_image(scans, np.array(list(placed.values())), settings.cell, settings.max_range)
-    return Mapped(recording, state, image)
+    return MapAfterVisit(recording, state, image)
 
 
-def _begin(recording: Recording) -> InitialPose:
+def _initial_pose(recording: Recording) -> InitialPose:
     """Where every visit begins, which is the origin of the map, as somebody says who points at it."""
     placed = keyframe_poses(recording.hybrid_map, recording.area_poses)
     nearest = min(placed, key=lambda keyframe: float(np.hypot(*placed[keyframe][:2])))
@@ -268,7 +274,7 @@ def _begin(recording: Recording) -> InitialPose:
     return InitialPose(area, PoseGaussian(pose, _POINTED_AT))
 
 
-def _visit(world: str, seed: int, number: int, *, changed: float, size: float, rate: float) -> SimulatedLog:
+def _simulate_visit(world: str, seed: int, number: int, *, changed: float, size: float, rate: float) -> SimulatedLog:
     # The first has two laps, so that its loop is closed; things are moved between visits alone, so that each has one
     # truth.
     return open_simulated(
@@ -286,40 +292,40 @@ def _frame(recording: Recording, first: SimulatedLog) -> NDArray[np.float64]:
     return np.array([*(truth[:, :2] - turned).mean(axis=0), turn])
 
 
-def _same(before: RunState, after: RunState) -> bool:
+def _is_same_map(before: RunState, after: RunState) -> bool:
     """Whether the best map of a state is in another one as it was."""
     one, other = (Replica.from_state(state.processes["slam"].replica) for state in (before, after))
-    known, now = one.maps[one.best_hypothesis], other.maps[other.best_hypothesis]
-    areas = known.area_ids()
-    arcs = {(a, b): arc for a, b, arc in now.all_arcs()}
+    old_map, new_map = one.maps[one.best_hypothesis], other.maps[other.best_hypothesis]
+    areas = old_map.area_ids()
+    arcs = {(a, b): arc for a, b, arc in new_map.all_arcs()}
     return (
-        all(_equal(known.keyframes(area), now.keyframes(area)) for area in areas)
-        and all(_equal({0: arc.pose.mean}, {0: arcs[a, b].pose.mean}) for a, b, arc in known.all_arcs())
-        and all(one.scans[k] is other.scans[k] for area in areas for k in known.keyframes(area))
+        all(_are_equal(old_map.keyframes(area), new_map.keyframes(area)) for area in areas)
+        and all(_are_equal({0: arc.pose.mean}, {0: arcs[a, b].pose.mean}) for a, b, arc in old_map.all_arcs())
+        and all(one.scans[k] is other.scans[k] for area in areas for k in old_map.keyframes(area))
     )
 
 
-def _equal(one: Mapping[int, NDArray[np.float64]], other: Mapping[int, NDArray[np.float64]]) -> bool:
+def _are_equal(one: Mapping[int, NDArray[np.float64]], other: Mapping[int, NDArray[np.float64]]) -> bool:
     return one.keys() == other.keys() and all((one[k] == other[k]).all() for k in one)
 
 
-def _told(name: str, seeds: Sequence[int], stayed: Sequence[Localized]) -> str:
-    own = (f"{seed} {one.error:.3f} ({one.worst:.3f})" for seed, one in zip(seeds, stayed, strict=True))
-    return f"{name}, localization, error and worst [m]: {', '.join(own)}."
+def _describe_localization(name: str, seeds: Sequence[int], localized: Sequence[LocalizationVisit]) -> str:
+    texts = (f"{seed} {visit.error:.3f} ({visit.worst:.3f})" for seed, visit in zip(seeds, localized, strict=True))
+    return f"{name}, localization, error and worst [m]: {', '.join(texts)}."
 
 
-def _row(name: str, one: Visit) -> list[str]:
-    shares = [f"{100.0 * one.gone:.0f} %", f"{100.0 * one.kept:.1f} %"]
-    shares += [f"{100.0 * share:.2f} %" for share in (one.before, one.after)]
+def _visit_row(name: str, visit: Visit) -> list[str]:
+    shares = [f"{100.0 * visit.gone:.0f} %", f"{100.0 * visit.kept:.1f} %"]
+    shares += [f"{100.0 * share:.2f} %" for share in (visit.before, visit.after)]
     return [
         name,
-        f"{one.metres[0]:.0f}",
-        f"{100.0 * one.new:.0f} %",
-        f"{one.metres[1]:.0f}",
+        f"{visit.lengths[0]:.0f}",
+        f"{100.0 * visit.new:.0f} %",
+        f"{visit.lengths[1]:.0f}",
         *shares,
-        f"{one.error:.3f}",
-        f"{one.worst:.3f}",
-        f"{one.keyframes[0]}, {one.keyframes[1]}",
+        f"{visit.error:.3f}",
+        f"{visit.worst:.3f}",
+        f"{visit.keyframes[0]}, {visit.keyframes[1]}",
     ]
 
 
@@ -355,34 +361,36 @@ class Surfaces(NamedTuple):
         """Which points (m, 2) enough scans have a free line of sight to."""
         index, counts = wall_index(self.walls), np.zeros(len(points), dtype=np.int64)
         for laser in self.lasers:
-            seen = se2.transform(se2.inverse(laser), points)
+            local = se2.transform(se2.inverse(laser), points)
             near = np.flatnonzero(
-                (np.hypot(*seen.T) <= _REACH) & (np.abs(np.arctan2(seen[:, 1], seen[:, 0])) <= self.half_field)
+                (np.hypot(*local.T) <= _REACH) & (np.abs(np.arctan2(local[:, 1], local[:, 0])) <= self.half_field)
             )
-            away = points[near] - laser[:2]
-            ends = laser[:2] + away * (1.0 - _SHORT / np.hypot(*away.T))[:, None]
+            directions = points[near] - laser[:2]
+            ends = laser[:2] + directions * (1.0 - _SHORT / np.hypot(*directions.T))[:, None]
             counts[near] += has_line_of_sight(index, np.broadcast_to(laser[:2], ends.shape).copy(), ends)
         return counts >= _LOOKS
 
 
-class Judgement(NamedTuple):
+class ChangeScores(NamedTuple):
     """How a map follows a change.
 
     :ivar new: share of the new surfaces that could be seen that is in the map.
     :ivar gone: share of the surfaces in the map before that could be seen to be gone that still is.
     :ivar kept: share of the surfaces in the map before that still stand where they did that is in the map after.
-    :ivar metres: of the new ones and of those that could be seen to be gone.
+    :ivar lengths: of the new ones and of those that could be seen to be gone.
     :ivar hidden: shape (k, 4), the surfaces that are gone and could not be seen to be, as short pieces.
     """
 
     new: float
     gone: float
     kept: float
-    metres: tuple[float, float]
+    lengths: tuple[float, float]
     hidden: NDArray[np.float64]
 
 
-def judged(images: Sequence[OccupancyImage], frames: Sequence[Points], visits: Sequence[Surfaces]) -> Judgement:
+def score_changes(
+    images: Sequence[OccupancyImage], frames: Sequence[Points], visits: Sequence[Surfaces]
+) -> ChangeScores:
     """How the second of two maps follows what changed between two visits.
 
     :param frames: ``world_T_map`` of each, shape (3,).
@@ -392,34 +400,36 @@ def judged(images: Sequence[OccupancyImage], frames: Sequence[Points], visits: S
     new = points[clearance(before.walls, points) > _APART]
     new = new[after.in_view(new)]
     points = before.points()
-    points = points[_held(images[0], frames[0], points)]
+    points = points[_is_occupied_near(images[0], frames[0], points)]
     apart = clearance(after.walls, points)
-    gone, stands = points[apart > _APART], points[apart < _SHORT]
-    shown = after.in_view(gone)
-    metres = _SAMPLE * len(new), _SAMPLE * int(shown.sum())
-    found, ghosts, kept = (_held(images[1], frames[1], part) for part in (new, gone[shown], stands))
-    hidden = np.concatenate((gone[~shown], gone[~shown] + 1e-3), axis=1)
-    return Judgement(_share(found), _share(ghosts), _share(kept), metres, hidden)
+    gone, remaining = points[apart > _APART], points[apart < _SHORT]
+    is_seen_gone = after.in_view(gone)
+    lengths = _SAMPLE * len(new), _SAMPLE * int(is_seen_gone.sum())
+    found, ghosts, kept = (
+        _is_occupied_near(images[1], frames[1], part) for part in (new, gone[is_seen_gone], remaining)
+    )
+    hidden = np.concatenate((gone[~is_seen_gone], gone[~is_seen_gone] + 1e-3), axis=1)
+    return ChangeScores(_share(found), _share(ghosts), _share(kept), lengths, hidden)
 
 
-def unexplained(image: OccupancyImage, frame: Points, walls: NDArray[np.float64]) -> float:
+def unexplained_share(image: OccupancyImage, frame: Points, walls: NDArray[np.float64]) -> float:
     """Share of the occupied cells that are far from all surfaces.
 
     :param frame: ``world_T_map``, shape (3,).
     """
-    return float(np.mean(clearance(np.ascontiguousarray(walls), _cells(image, frame)) > _APART))
+    return float(np.mean(clearance(np.ascontiguousarray(walls), _occupied_cells(image, frame)) > _APART))
 
 
-def _cells(image: OccupancyImage, frame: Points) -> Points:
+def _occupied_cells(image: OccupancyImage, frame: Points) -> Points:
     """The middles of the occupied cells, shape (n, 2), world frame."""
     row, column = np.nonzero(image.pixels[::-1] == OCCUPIED)
     cells = image.origin + image.resolution * (np.stack((column, row), axis=1) + 0.5)
     return np.ascontiguousarray(se2.transform(frame, cells))
 
 
-def _held(image: OccupancyImage, frame: Points, points: Points) -> NDArray[np.bool_]:
+def _is_occupied_near(image: OccupancyImage, frame: Points, points: Points) -> NDArray[np.bool_]:
     """Which points (n, 2), world frame, have an occupied cell beside them."""
-    cells = _cells(image, frame)
+    cells = _occupied_cells(image, frame)
     return np.asarray(clearance(np.concatenate((cells, cells), axis=1), points) <= _HELD, dtype=np.bool_)
 
 

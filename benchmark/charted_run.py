@@ -92,7 +92,9 @@ def resident_bytes() -> int:
     return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def charted(way: str, log: TimedLog, configuration: Configuration) -> tuple[RunResult, FinalMap, dict[str, Any]]:
+def map_and_monitor(
+    variant: str, log: TimedLog, configuration: Configuration
+) -> tuple[RunResult, FinalMap, dict[str, Any]]:
     """Map a log; what came of it, and what it cost."""
     gc.freeze()
     every = max(1, log.scan_count // SAMPLES)
@@ -102,7 +104,7 @@ def charted(way: str, log: TimedLog, configuration: Configuration) -> tuple[RunR
         if scans % every == 0:
             memory.append((scans, resident_bytes()))
 
-    result = run_log(log, configuration, sample, WAYS[way])
+    result = run_log(log, configuration, sample, WAYS[variant])
     memory.append((len(result.log_progress.stamps), resident_bytes()))
     begin, log_seconds = time.process_time(), log.seconds
     final = final_map(
@@ -113,7 +115,7 @@ def charted(way: str, log: TimedLog, configuration: Configuration) -> tuple[RunR
     facts = {
         "particles": configuration.filter.particles,
         "scans": len(result.log_progress.stamps),
-        "travelled_m": final.recording.probabilities[-1].path_length,
+        "traveled_m": final.recording.probabilities[-1].path_length,
         "areas": len(hybrid_map.area_ids()),
         "loop_closures": sum(arc.closure for _, _, arc in hybrid_map.all_arcs()),
         "log_s": log.seconds,
@@ -140,11 +142,11 @@ def _cost(result: RunResult, every: int) -> list[dict[str, float]]:
 
 def main(arguments: list[str]) -> int:
     """Run; return the exit status."""
-    way, *rest = arguments
+    variant, *rest = arguments
     options = build_parser().parse_args(["map", *rest])
     try:
         configuration = chosen_configuration(options)
-        result, final, facts = charted(way, TimedLog(open_log(options.log)), configuration)
+        result, final, facts = map_and_monitor(variant, TimedLog(open_log(options.log)), configuration)
     except HmtSlamError as fault:
         print(f"charted_run: {fault}", file=sys.stderr)
         return 2

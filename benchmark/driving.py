@@ -34,13 +34,13 @@ class Leg(NamedTuple):
 
     :ivar reached: whether the robot arrived in time.
     :ivar contacts: how often it came upon something.
-    :ivar metres: driven.
+    :ivar distance: driven.
     :ivar seconds: of the simulation.
     """
 
     reached: bool
     contacts: int
-    metres: float
+    distance: float
     seconds: float
 
 
@@ -77,10 +77,10 @@ def goals_of(scenario: Scenario) -> NDArray[np.float64]:
     return np.concatenate((middles[1:], middles[-2::-1]))
 
 
-def driven(scenario: Scenario, most: int | None = None) -> Iterator[Leg]:
+def drive_goals(scenario: Scenario, max_goals: int | None = None) -> Iterator[Leg]:
     """Drive from goal to goal.
 
-    :param most: of the goals, None for all.
+    :param max_goals: of the goals, None for all.
     """
     settings = scenario.settings
     limits = MotionLimits(
@@ -92,11 +92,11 @@ def driven(scenario: Scenario, most: int | None = None) -> Iterator[Leg]:
         period=1.0 / settings.rate,
     )
     robot = DrivenRobot(scenario)
-    for goal in goals_of(scenario)[:most]:
-        contacts, metres, begin = robot.contacts, robot.distance_traveled, robot.stamp
+    for goal in goals_of(scenario)[:max_goals]:
+        contacts, distance, begin = robot.contacts, robot.distance_traveled, robot.stamp
         reached = _drive_to(robot, goal, limits)
         seconds = (robot.stamp - begin) / NANOSECONDS
-        yield Leg(reached, robot.contacts - contacts, robot.distance_traveled - metres, seconds)
+        yield Leg(reached, robot.contacts - contacts, robot.distance_traveled - distance, seconds)
         if not reached:
             robot.kidnap(np.array([*goal, robot.pose[2]]))
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmark.driven_run import DrivenRun, true_place
-from benchmark.institute_maps import NEAR, PEOPLE, Judged, charted, judged, scenario_of
+from benchmark.institute_maps import NEAR, PEOPLE, ChartScores, chart_map, scenario_of, score_chart
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings, chosen_seeds
@@ -25,7 +25,7 @@ from hmt_slam_ros.simulation.scenario import START
 SEEDS = 5
 """Buildings, each explored once."""
 
-MISSIONS, METRES = 5, 180.0
+MISSIONS, MISSION_DISTANCE = 5, 180.0
 """In each of them missions are at least so many and so long in all, m: in five, 25 and 900 m, as in the paper."""
 
 _TIME, _MISSION = 2000.0, 300.0  # s, of the simulation, for an exploration and for a mission
@@ -40,7 +40,7 @@ POLICY = (
     f"place the robot came within {_PASSED:g} m. On the chart: states with a node of the chart within "
     f"{NEAR:g} m. Confused: nodes that are a crossing where there is a door or the other way, or at no state; ends of "
     "hallways are not counted. Rooms entered: true ones that the robot was in. "
-    f"Then at least {MISSIONS} missions one after the other, until they are {METRES:g} m in all, each to another one, "
+    f"Then at least {MISSIONS} missions one after the other, until they are {MISSION_DISTANCE:g} m in all, each to another one, "
     "drawn by chance, of the rooms that the explorer found and named, with mapping going on. A mission is a success "
     "where the robot says that it is there, in "
     f"{_MISSION:g} s and is within {_OFF:g} m of where it truly was when it took the keyframe that stands for the "
@@ -49,11 +49,11 @@ POLICY = (
 )
 
 
-class Explored(NamedTuple):
+class Exploration(NamedTuple):
     """An exploration.
 
     :ivar finished: whether the explorer said that it is at its end.
-    :ivar metres: driven.
+    :ivar distance: driven.
     :ivar seconds: of the simulation.
     :ivar contacts: how often the robot came upon something.
     :ivar passed: states that the robot passed.
@@ -64,14 +64,14 @@ class Explored(NamedTuple):
     """
 
     finished: bool
-    metres: float
+    distance: float
     seconds: float
     contacts: int
     passed: int
     entered: int
     rooms: int
     named: int
-    chart: Judged
+    chart: ChartScores
 
 
 class Mission(NamedTuple):
@@ -79,14 +79,14 @@ class Mission(NamedTuple):
 
     :ivar success: whether the robot is where it was to go, and knows it.
     :ivar off: distance from there, m.
-    :ivar metres: driven.
+    :ivar distance: driven.
     :ivar seconds: of the simulation.
     :ivar contacts: how often the robot came upon something.
     """
 
     success: bool
     off: float
-    metres: float
+    distance: float
     seconds: float
     contacts: int
 
@@ -95,38 +95,42 @@ def measure_explore(settings: Settings) -> Report:
     """Explore institutes, and go on missions there."""
     seeds = chosen_seeds(settings, SEEDS)
     configuration = load_configuration(PARAMETERS, list(settings.changes))
-    explorations: list[Explored] = []
+    explorations: list[Exploration] = []
     missions: list[list[Mission]] = []
     for seed in seeds:
         robot = DrivenRobot(scenario_of(seed))
         run = DrivenRun(robot, configuration, Explorer(configuration))
-        explorations.append(_explored(run, configuration))
-        missions.append(_missions(run, seed))
+        explorations.append(_explore(run, configuration))
+        missions.append(_drive_missions(run, seed))
     report = Report("explore", "Exploration of an institute, and missions", seeds=seeds)
-    report.requirements = _requirements(explorations, [one for own in missions for one in own])
+    report.requirements = _requirements(
+        explorations, [mission for missions_of_seed in missions for mission in missions_of_seed]
+    )
     report.body += [_table_of_explorations(seeds, explorations), _table_of_missions(seeds, missions), POLICY]
     return report
 
 
-def _explored(run: DrivenRun[Explorer], configuration: Configuration) -> Explored:
+def _explore(run: DrivenRun[Explorer], configuration: Configuration) -> Exploration:
     """Explore, and compare with the truth."""
     robot, scenario = run.robot, run.robot.scenario
-    outcome = run.do(Task("explore"), _TIME)
+    outcome = run.run_task(Task("explore"), _TIME)
     path = robot.true_poses(np.arange(START, robot.stamp, NANOSECONDS // 5))[:, :2]
     states, rooms = scenario.building.states, scenario.building.rooms
-    away = [float(np.hypot(*(path - state[:2]).T).min()) for state in states.poses]
-    atlas = run.driver.exploration_map
-    institute = charted(scenario, atlas.hybrid_map, atlas.replica.scans, robot.true_poses, configuration)
-    return Explored(
+    distances = [float(np.hypot(*(path - state[:2]).T).min()) for state in states.poses]
+    exploration_map = run.driver.exploration_map
+    institute = chart_map(
+        scenario, exploration_map.hybrid_map, exploration_map.replica.scans, robot.true_poses, configuration
+    )
+    return Exploration(
         outcome is not None,
         robot.distance_traveled,
         (robot.stamp - START) / NANOSECONDS,
         robot.contacts,
-        sum(distance <= _PASSED for distance in away),
+        sum(state_distance <= _PASSED for state_distance in distances),
         sum(is_within(room, path) for room in rooms),
         len(rooms),
-        sum(name.startswith("room ") for name in atlas.named_places()),
-        judged(institute),
+        sum(name.startswith("room ") for name in exploration_map.named_places()),
+        score_chart(institute),
     )
 
 
@@ -136,12 +140,12 @@ def is_within(room: Float64, path: Float64) -> bool:
     return bool(np.any((np.abs(local[:, 0]) < 0.5 * room[3]) & (np.abs(local[:, 1]) < 0.5 * room[4])))
 
 
-def _missions(run: DrivenRun[Explorer], seed: int) -> list[Mission]:
+def _drive_missions(run: DrivenRun[Explorer], seed: int) -> list[Mission]:
     """Go to rooms drawn by chance, never twice in a row to the same."""
     draw, robot, begin = np.random.default_rng(seed), run.robot, run.robot.distance_traveled
     found: list[Mission] = []
     last = ""
-    while len(found) < MISSIONS or (robot.distance_traveled - begin < METRES and len(found) < _MOST):
+    while len(found) < MISSIONS or (robot.distance_traveled - begin < MISSION_DISTANCE and len(found) < _MOST):
         names = [
             name for name in run.driver.exploration_map.named_places() if name.startswith("room ") and name != last
         ]
@@ -149,27 +153,27 @@ def _missions(run: DrivenRun[Explorer], seed: int) -> list[Mission]:
             found.append(Mission(False, math.inf, 0.0, 0.0, 0))
             continue
         last = names[int(draw.integers(len(names)))]
-        found.append(_mission(run, last))
+        found.append(_drive_mission(run, last))
     return found
 
 
-def _mission(run: DrivenRun[Explorer], name: str) -> Mission:
+def _drive_mission(run: DrivenRun[Explorer], name: str) -> Mission:
     """Go to a place."""
     robot, place = run.robot, true_place(run, name)
-    metres, begin, contacts = robot.distance_traveled, robot.stamp, robot.contacts
-    outcome = run.do(Task("go", name), _MISSION)
+    distance, begin, contacts = robot.distance_traveled, robot.stamp, robot.contacts
+    outcome = run.run_task(Task("go", name), _MISSION)
     off = float(np.hypot(*(robot.pose - place)[:2]))
     success = outcome is not None and outcome.succeeded and off <= _OFF
     seconds = (robot.stamp - begin) / NANOSECONDS
-    return Mission(success, off, robot.distance_traveled - metres, seconds, robot.contacts - contacts)
+    return Mission(success, off, robot.distance_traveled - distance, seconds, robot.contacts - contacts)
 
 
-def _requirements(explorations: Sequence[Explored], missions: Sequence[Mission]) -> list[Requirement]:
+def _requirements(explorations: Sequence[Exploration], missions: Sequence[Mission]) -> list[Requirement]:
     charts = [one.chart for one in explorations]
     states, rooms = sum(one.states for one in charts), sum(one.rooms for one in explorations)
     contacts = sum(one.contacts for one in explorations) + sum(one.contacts for one in missions)
-    metres = sum(one.metres for one in missions)
-    speed = metres / max(1e-9, sum(one.seconds for one in missions))
+    distance = sum(one.distance for one in missions)
+    speed = distance / max(1e-9, sum(one.seconds for one in missions))
     return [
         Requirement("explorations that end", float(np.mean([one.finished for one in explorations])), 1.0, least=1.0),
         Requirement("states passed", sum(one.passed for one in explorations) / states, 1.0, least=_STATES),
@@ -177,13 +181,13 @@ def _requirements(explorations: Sequence[Explored], missions: Sequence[Mission])
         Requirement("states on the chart", sum(one.detected for one in charts) / states, 1.0, least=_STATES),
         Requirement("nodes confused, of the states", sum(one.confused for one in charts) / states, _CONFUSED),
         Requirement("missions that succeed", float(np.mean([one.success for one in missions])), 1.0, least=1.0),
-        Requirement("way of missions", metres, math.inf, "m", least=METRES * len(explorations)),
+        Requirement("way of missions", distance, math.inf, "m", least=MISSION_DISTANCE * len(explorations)),
         Requirement("mean speed of missions", speed, math.inf, "m/s", least=_PAPER_SPEED),
         Requirement("contacts", float(contacts), 0.0),
     ]
 
 
-def _table_of_explorations(seeds: Sequence[int], explorations: Sequence[Explored]) -> str:
+def _table_of_explorations(seeds: Sequence[int], explorations: Sequence[Exploration]) -> str:
     head = [
         "exploration",
         "way [m]",
@@ -199,7 +203,7 @@ def _table_of_explorations(seeds: Sequence[int], explorations: Sequence[Explored
     rows = [
         [
             str(seed),
-            f"{one.metres:.0f}",
+            f"{one.distance:.0f}",
             f"{one.seconds:.0f}",
             str(one.chart.states),
             str(one.passed),
@@ -217,17 +221,19 @@ def _table_of_explorations(seeds: Sequence[int], explorations: Sequence[Explored
 def _table_of_missions(seeds: Sequence[int], missions: Sequence[Sequence[Mission]]) -> str:
     head = ["missions", "number", "success", "way [m]", "mean speed [m/s]", "off, median [m]", "most", "contacts"]
     every = [one for own in missions for one in own]
-    rows = [[name, *_cells(own)] for name, own in (*zip(map(str, seeds), missions, strict=True), ("all", every))]
+    rows = [
+        [name, *_mission_cells(own)] for name, own in (*zip(map(str, seeds), missions, strict=True), ("all", every))
+    ]
     return table(head, rows)
 
 
-def _cells(missions: Sequence[Mission]) -> list[str]:
-    metres, off = sum(one.metres for one in missions), np.array([one.off for one in missions])
-    speed = metres / max(1e-9, sum(one.seconds for one in missions))
+def _mission_cells(missions: Sequence[Mission]) -> list[str]:
+    distance, off = sum(one.distance for one in missions), np.array([one.off for one in missions])
+    speed = distance / max(1e-9, sum(one.seconds for one in missions))
     return [
         str(len(missions)),
         str(sum(one.success for one in missions)),
-        f"{metres:.0f}",
+        f"{distance:.0f}",
         f"{speed:.2f}",
         f"{np.median(off):.2f}",
         f"{off.max():.2f}",

@@ -22,13 +22,13 @@ _TIMES = 400  # in a drive at which the heading is compared
 _SAME = 1e-6  # rad
 
 
-def headings(world: World, laser: str, configuration: Configuration) -> NDArray[np.float64]:
+def heading_errors(world: World, laser: str, configuration: Configuration) -> NDArray[np.float64]:
     """Along a drive: error of the filter, its deviation, error of the odometry, rad, and lines used, shape (n, 4)."""
     scenario = open_simulated(",".join(filter(None, (world.log, laser)))).scenario
     features = replace(configuration.features, range_deviation=scenario.settings.range_noise)
     heading, count, readings = BuildingHeading(features), len(scenario.scan_stamps), scenario.settings.readings
-    judged = set(np.linspace(0, count - 1, _TIMES).astype(np.int64).tolist())
-    rows, begin, axis = [], math.nan, _axis(scenario)
+    sampled = set(np.linspace(0, count - 1, _TIMES).astype(np.int64).tolist())
+    rows, begin, axis = [], math.nan, _wall_direction(scenario)
     for number in range(count):
         if number:
             before, here = scenario.odometry[(number - 1) * readings], scenario.odometry[number * readings]
@@ -38,14 +38,14 @@ def headings(world: World, laser: str, configuration: Configuration) -> NDArray[
         true, odometry = scenario.poses[number * readings][2] - axis, scenario.odometry[number * readings][2]
         if heading.is_known and math.isnan(begin):
             begin = QUARTER_TURN * round((true - heading.angle) / QUARTER_TURN)
-            ahead = odometry - true
-        if heading.is_known and number in judged:
+            odometry_offset = odometry - true
+        if heading.is_known and number in sampled:
             error = float(se2.wrap(heading.angle + begin - true))
-            rows.append([error, math.sqrt(heading.variance), float(se2.wrap(odometry - true - ahead)), used])
+            rows.append([error, math.sqrt(heading.variance), float(se2.wrap(odometry - true - odometry_offset)), used])
     return np.array(rows).reshape(-1, 4)
 
 
-def _axis(scenario: Scenario) -> float:
+def _wall_direction(scenario: Scenario) -> float:
     """Direction in which a building's walls run, up to quarters, rad; of its lines that of most."""
     alphas = true_lines(scenario, int(scenario.scan_stamps[0]), np.zeros(3))[:, 0] % QUARTER_TURN
     apart = np.abs(alphas[:, None] - alphas[None, :])

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import networkx
 import numpy as np
 
-from benchmark.institute_maps import PEOPLE, InstituteMap, mapped, scenario_of
+from benchmark.institute_maps import PEOPLE, InstituteMap, map_institute, scenario_of
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings, chosen_seeds
@@ -89,43 +89,55 @@ def measure_institute(settings: Settings) -> Report:
     seeds = chosen_seeds(settings, SEEDS)
     configuration = load_configuration(PARAMETERS, list(settings.changes))
     with ProcessPoolExecutor(settings.records.jobs) as pool:
-        buildings = list(pool.map(partial(_of_building, configuration=configuration), seeds))
-    missions = {name: [one for building in buildings for one in building[name][0]] for name in _CHANGED}
-    lost = {name: [one for building in buildings for one in building[name][1]] for name in _CHANGED}
+        buildings = list(pool.map(partial(_measure_building, configuration=configuration), seeds))
+    missions = {name: [mission for building in buildings for mission in building[name][0]] for name in _CHANGED}
+    relocations = {name: [mission for building in buildings for mission in building[name][1]] for name in _CHANGED}
     report = Report("institute", "Missions and relocations in an institute", seeds=seeds)
-    known = next(iter(_CHANGED))
-    report.requirements = [*_mission_requirements(missions[known]), *_relocation_requirements(lost[known])]
-    report.body += [_mission_table(missions), _relocation_table(lost), POLICY]
+    as_mapped = next(iter(_CHANGED))
+    report.requirements = [
+        *_mission_requirements(missions[as_mapped]),
+        *_relocation_requirements(relocations[as_mapped]),
+    ]
+    report.body += [_mission_table(missions), _relocation_table(relocations), POLICY]
     return report
 
 
-def _of_building(seed: int, configuration: Configuration) -> dict[str, tuple[list[Mission], list[list[Estimate]]]]:
+def _measure_building(seed: int, configuration: Configuration) -> dict[str, tuple[list[Mission], list[list[Estimate]]]]:
     """Missions and relocations in one building, with the doors as mapped and changed."""
-    institute = mapped(seed, configuration)
+    institute = map_institute(seed, configuration)
     scenarios = {name: scenario_of(seed, visit=1, changed=changed) for name, changed in _CHANGED.items()}
     return {
-        name: (missions_of(institute, own, configuration), relocations_of(institute, own, configuration))
-        for name, own in scenarios.items()
+        name: (missions_of(institute, scenario, configuration), relocations_of(institute, scenario, configuration))
+        for name, scenario in scenarios.items()
     }
 
 
 def _mission_requirements(missions: Sequence[Mission]) -> list[Requirement]:
     estimates = [estimate for mission in missions for estimate in mission.estimates]
-    false = [not one.right for one in estimates]
-    confident = [one.confident and not one.right for one in estimates]
+    false = [not estimate.right for estimate in estimates]
+    confident = [estimate.confident and not estimate.right for estimate in estimates]
     nees = [mission.errors[2] for mission in missions if mission.errors is not None]
     return [
-        Requirement("missions that succeed", _mean([one.success for one in missions]), 1.0, least=_SUCCESS),
-        Requirement("missions that reach their place", _mean([one.reached for one in missions]), 1.0, least=_SUCCESS),
-        Requirement("false state transitions", _mean(_transitions(missions)), _TRANSITIONS),
-        Requirement("unconfident estimates", _mean([not one.confident for one in estimates]), _UNCONFIDENT),
-        Requirement("false estimates", _mean(false), _FALSE),
-        Requirement("confident false estimates", _mean(confident), _CONFIDENT_FALSE),
-        Requirement("NEES of the metric start, mean", _mean(nees), _NEES[1], least=_NEES[0]),
+        Requirement(
+            "missions that succeed", mean_or_nan([estimate.success for estimate in missions]), 1.0, least=_SUCCESS
+        ),
+        Requirement(
+            "missions that reach their place",
+            mean_or_nan([estimate.reached for estimate in missions]),
+            1.0,
+            least=_SUCCESS,
+        ),
+        Requirement("false state transitions", mean_or_nan(false_transitions(missions)), _TRANSITIONS),
+        Requirement(
+            "unconfident estimates", mean_or_nan([not estimate.confident for estimate in estimates]), _UNCONFIDENT
+        ),
+        Requirement("false estimates", mean_or_nan(false), _FALSE),
+        Requirement("confident false estimates", mean_or_nan(confident), _CONFIDENT_FALSE),
+        Requirement("NEES of the metric start, mean", mean_or_nan(nees), _NEES[1], least=_NEES[0]),
     ]
 
 
-def _transitions(missions: Sequence[Mission]) -> list[bool]:
+def false_transitions(missions: Sequence[Mission]) -> list[bool]:
     """Of all nodes that were noticed, whether the estimate after that is wrong."""
     return [
         not after.right
@@ -139,8 +151,10 @@ def _relocation_requirements(runs: Sequence[Sequence[Estimate]]) -> list[Require
     found = [estimate for run in runs if (estimate := recovery(run)) is not None]
     return [
         Requirement("relocations that recover", len(found) / len(runs), 1.0, least=1.0),
-        Requirement("distance for recovering, mean", _mean([one.metres for one in found]), _METRES, "m"),
-        Requirement("states for recovering, mean", _mean([one.arrivals for one in found]), _STATES),
+        Requirement(
+            "distance for recovering, mean", mean_or_nan([estimate.distance for estimate in found]), _METRES, "m"
+        ),
+        Requirement("states for recovering, mean", mean_or_nan([estimate.arrivals for estimate in found]), _STATES),
     ]
 
 
@@ -150,7 +164,7 @@ def _mission_table(missions: dict[str, list[Mission]]) -> str:
         ["Success", "25 / 100 %"],
         ["Place in the room reached", "-"],
         ["Contacts", "-"],
-        ["Total travelled distance [m]", "899"],
+        ["Total traveled distance [m]", "899"],
         ["Mean travel distance [m]", "36"],
         ["Mean travel speed [m/s]", "0.31"],
         ["Total state transitions", "181"],
@@ -171,26 +185,26 @@ def _mission_table(missions: dict[str, list[Mission]]) -> str:
 
 def _mission_column(missions: Sequence[Mission]) -> list[str]:
     estimates = [estimate for mission in missions for estimate in mission.estimates]
-    metres, seconds = sum(one.metres for one in missions), sum(one.seconds for one in missions)
+    distance, seconds = sum(one.distance for one in missions), sum(one.seconds for one in missions)
     errors = np.array([one.errors for one in missions if one.errors is not None]).reshape(-1, 3)
-    transitions = _transitions(missions)
+    transitions = false_transitions(missions)
     return [
         str(len(missions)),
-        _share([one.success for one in missions]),
-        _share([one.reached for one in missions]),
+        format_share([one.success for one in missions]),
+        format_share([one.reached for one in missions]),
         str(sum(one.contacts for one in missions)),
-        f"{metres:.0f}",
-        f"{metres / len(missions):.0f}",
-        f"{metres / seconds:.2f}",
+        f"{distance:.0f}",
+        f"{distance / len(missions):.0f}",
+        f"{distance / seconds:.2f}",
         str(len(transitions)),
-        _share(transitions),
+        format_share(transitions),
         str(len(estimates)),
-        _share([not one.confident for one in estimates]),
-        _share([not one.right for one in estimates]),
-        _share([one.confident and not one.right for one in estimates]),
-        f"{100.0 * _mean(errors[:, 0]):.1f}",
-        f"{math.degrees(_mean(errors[:, 1])):.2f}",
-        f"{_mean(errors[:, 2]):.2f}",
+        format_share([not one.confident for one in estimates]),
+        format_share([not one.right for one in estimates]),
+        format_share([one.confident and not one.right for one in estimates]),
+        f"{100.0 * mean_or_nan(errors[:, 0]):.1f}",
+        f"{math.degrees(mean_or_nan(errors[:, 1])):.2f}",
+        f"{mean_or_nan(errors[:, 2]):.2f}",
     ]
 
 
@@ -198,7 +212,7 @@ def _relocation_table(lost: dict[str, list[list[Estimate]]]) -> str:
     rows = [
         ["Number of experiments", "10"],
         ["Recovered", "10"],
-        ["Total travelled distance [m]", "250"],
+        ["Total traveled distance [m]", "250"],
         ["Mean distance for recovering [m]", "13.7"],
         ["Min / max distance for recovering [m]", "1.21 / 20.31"],
         ["Mean number of states for recovering", "2.11"],
@@ -206,15 +220,15 @@ def _relocation_table(lost: dict[str, list[list[Estimate]]]) -> str:
     ]
     for runs in lost.values():
         found = [estimate for run in runs if (estimate := recovery(run)) is not None]
-        metres, states = [one.metres for one in found], [one.arrivals for one in found]
-        travelled = sum(run[-1].metres for run in runs if run)
+        distance, states = [one.distance for one in found], [one.arrivals for one in found]
+        traveled = sum(run[-1].distance for run in runs if run)
         cells = [
             str(len(runs)),
             str(len(found)),
-            f"{travelled:.0f}",
-            f"{_mean(metres):.1f}",
-            f"{min(metres, default=math.nan):.2f} / {max(metres, default=math.nan):.2f}",
-            f"{_mean(states):.2f}",
+            f"{traveled:.0f}",
+            f"{mean_or_nan(distance):.1f}",
+            f"{min(distance, default=math.nan):.2f} / {max(distance, default=math.nan):.2f}",
+            f"{mean_or_nan(states):.2f}",
             f"{min(states, default=0)} / {max(states, default=0)}",
         ]
         for row, cell in zip(rows, cells, strict=True):
@@ -222,26 +236,26 @@ def _relocation_table(lost: dict[str, list[list[Estimate]]]) -> str:
     return table(["relocations", "paper", *lost], rows)
 
 
-def _mean(values: Sequence[float] | Float64) -> float:
+def mean_or_nan(values: Sequence[float] | Float64) -> float:
     return float(np.mean(values)) if len(values) else math.nan
 
 
-def _share(values: Sequence[bool]) -> str:
-    return f"{sum(values)} / {100.0 * _mean(values):.1f} %" if values else "-"
+def format_share(values: Sequence[bool]) -> str:
+    return f"{sum(values)} / {100.0 * mean_or_nan(values):.1f} %" if values else "-"
 
 
 class Estimate(NamedTuple):
     """A belief and what is true.
 
     :ivar arrivals: openings noticed so far.
-    :ivar metres: travelled so far.
+    :ivar distance: traveled so far.
     :ivar probability: of the most likely state.
     :ivar confident: whether the belief is.
     :ivar right: whether that state is the true one.
     """
 
     arrivals: int
-    metres: float
+    distance: float
     probability: float
     confident: bool
     right: bool
@@ -252,7 +266,7 @@ class Mission(NamedTuple):
 
     :ivar success: whether the robot was confident before the door of its goal, and went over to the metric filter.
     :ivar reached: whether it is at the place in the room then, as it says.
-    :ivar metres: driven.
+    :ivar distance: driven.
     :ivar seconds: of the simulation.
     :ivar contacts: how often it came upon something.
     :ivar estimates: on the way.
@@ -261,14 +275,14 @@ class Mission(NamedTuple):
 
     success: bool
     reached: bool
-    metres: float
+    distance: float
     seconds: float
     contacts: int
     estimates: list[Estimate]
     errors: tuple[float, float, float] | None
 
 
-class Steered:
+class BeliefDrivenRobot:
     """A driven robot that its belief steers.
 
     :ivar estimates: at every scan in a hallway, while the robot does not turn.
@@ -296,7 +310,7 @@ class Steered:
             period=1.0 / settings.rate,
         )
         self._institute, self._configuration = institute, configuration
-        self._known = known_of(institute, configuration)
+        self._known = known_building(institute, configuration)
         self.robot = DrivenRobot(scenario, start)
         belief = None if state is None else certain_belief(self._known.graph, configuration.places, state)
         self.pilot = MissionController(self._known, configuration, limits, belief)
@@ -306,7 +320,7 @@ class Steered:
     def mission(self, goal: Destination) -> Mission:
         """Drive to a place."""
         robot, pilot = self.robot, self.pilot
-        begin, metres, contacts = robot.stamp, robot.distance_traveled, robot.contacts
+        begin, distance, contacts = robot.stamp, robot.distance_traveled, robot.contacts
         self.estimates, found = [], None
         pilot.start_mission(goal)
         while robot.stamp < begin + TIME * NANOSECONDS and pilot.phase not in {Phase.THERE, Phase.LOST}:
@@ -320,7 +334,7 @@ class Steered:
         return Mission(
             success,
             reached,
-            robot.distance_traveled - metres,
+            robot.distance_traveled - distance,
             (robot.stamp - begin) / NANOSECONDS,
             robot.contacts - contacts,
             self.estimates,
@@ -357,7 +371,7 @@ class Steered:
         return math.hypot(off[0], off[1]), abs(float(off[2])), nees
 
 
-def known_of(institute: InstituteMap, configuration: Configuration) -> KnownBuilding:
+def known_building(institute: InstituteMap, configuration: Configuration) -> KnownBuilding:
     """What the robot knows of an institute."""
     graph = institute.chart.graph(configuration.places)
     return KnownBuilding(institute.chart, graph, institute.hybrid_map, institute.scans)
@@ -386,14 +400,14 @@ def axis_of(institute: InstituteMap, state: int) -> Float64:
 def missions_of(institute: InstituteMap, scenario: Scenario, configuration: Configuration) -> list[Mission]:
     """From room to room; where one fails, somebody carries the robot before the door of its goal."""
     random = np.random.default_rng([scenario.settings.seed, 1])
-    places = destinations(known_of(institute, configuration))
+    places = destinations(known_building(institute, configuration))
     doors = open_doors(institute, scenario, places)
     start, steered, missions = int(random.choice(doors)), None, []
     for _ in range(MISSIONS):
         goal = _next_stop(random, institute, doors, start)
         if steered is None:
-            state = _leaving(institute, start, goal)
-            steered = Steered(institute, scenario, configuration, axis_of(institute, state), state)
+            state = _departure_state(institute, start, goal)
+            steered = BeliefDrivenRobot(institute, scenario, configuration, axis_of(institute, state), state)
         missions.append(steered.mission(places[goal]))
         if not missions[-1].reached:
             steered = None
@@ -426,9 +440,9 @@ def _next_stop(random: np.random.Generator, institute: InstituteMap, doors: Sequ
     return int(random.choice(far or [max(ways, key=lambda door: ways[door])]))
 
 
-def _leaving(institute: InstituteMap, start: int, goal: int) -> int:
+def _departure_state(institute: InstituteMap, start: int, goal: int) -> int:
     """The state of a robot that leaves a node on the shortest way to another one."""
-    first = networkx.shortest_path(_ways(institute), start, goal, weight="length")[1]
+    first = networkx.shortest_path(_place_graph(institute), start, goal, weight="length")[1]
     edges = institute.chart.edges
     direction = next(edge.start_direction for edge in edges if (edge.start, edge.end) == (start, first))
     return state_of(start, direction)
@@ -436,10 +450,10 @@ def _leaving(institute: InstituteMap, start: int, goal: int) -> int:
 
 def way_length(institute: InstituteMap, node: int, goal: int) -> float:
     """Of the shortest way from one node to another one, m."""
-    return float(networkx.shortest_path_length(_ways(institute), node, goal, weight="length"))
+    return float(networkx.shortest_path_length(_place_graph(institute), node, goal, weight="length"))
 
 
-def _ways(institute: InstituteMap) -> networkx.Graph:
+def _place_graph(institute: InstituteMap) -> networkx.Graph:
     ways = networkx.Graph()
     for edge in institute.chart.edges:
         ways.add_edge(edge.start, edge.end, length=edge.distance[0])
@@ -449,10 +463,10 @@ def _ways(institute: InstituteMap) -> networkx.Graph:
 def relocations_of(institute: InstituteMap, scenario: Scenario, configuration: Configuration) -> list[list[Estimate]]:
     """The estimates of robots that are lost at first."""
     random = np.random.default_rng([scenario.settings.seed, 2])
-    return [_relocation(institute, scenario, configuration, random) for _ in range(RELOCATIONS)]
+    return [_drive_relocation(institute, scenario, configuration, random) for _ in range(RELOCATIONS)]
 
 
-def _relocation(
+def _drive_relocation(
     institute: InstituteMap, scenario: Scenario, configuration: Configuration, random: np.random.Generator
 ) -> list[Estimate]:
     edges = list({(edge.start, edge.start_direction): edge for edge in institute.chart.edges}.values())
@@ -460,7 +474,7 @@ def _relocation(
     edge = edges[int(random.choice(len(lengths), p=lengths / lengths.sum()))]
     ahead = np.array((random.uniform(0.2, 0.8) * edge.distance[0], 0.0, 0.0))
     start = se2.compose(axis_of(institute, state_of(edge.start, edge.start_direction)), ahead)
-    steered = Steered(institute, scenario, configuration, start)
+    steered = BeliefDrivenRobot(institute, scenario, configuration, start)
     steered.pilot.start_mission(None)
     end = steered.robot.stamp + _LOST * NANOSECONDS
     while steered.robot.distance_traveled < FAR and steered.robot.stamp < end and recovery(steered.estimates) is None:

@@ -10,8 +10,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmark.allocations import counted, requirements_on, told
-from benchmark.logs import BUNDLED, opened
+from benchmark.allocations import count_allocations, describe_counts, requirements_on
+from benchmark.logs import BUNDLED, open_logs
 from benchmark.report import Report, table
 from benchmark.settings import Settings
 from hmt_slam_ros.area_abstraction.overlap import overlaps, sensed_points
@@ -49,7 +49,7 @@ ALLOCATIONS = (
 )
 
 
-class Figures:
+class Timer:
     """CPU seconds of pieces of work, and how much of what they did.
 
     The least of several repetitions counts: what is above it is other programs' doing.
@@ -59,7 +59,7 @@ class Figures:
         self._seconds: dict[str, float] = {}
         self._amounts: dict[str, int] = {}
 
-    def timed(self, name: str, amount: int, work: Callable[[], object]) -> None:
+    def add(self, name: str, amount: int, work: Callable[[], object]) -> None:
         """Do a piece of work, and add it to what was done under this name."""
         begin = time.process_time()
         work()
@@ -75,35 +75,35 @@ def measure_kernels(settings: Settings) -> Report:
     """Time the loops on a log, the bundled one if none is named, and count what they take from the heap."""
     report = Report("kernels", "What the inner loops cost", seeds=(0,))
     configuration = load_configuration(settings=settings.changes)
-    with opened(settings.logs_or((BUNDLED,))) as logs:
+    with open_logs(settings.logs_or((BUNDLED,))) as logs:
         for log in logs:
-            _tell_times(report, log.name, open_log(log.path), configuration)
-            _tell_allocations(report, log.name, open_log(log.path), configuration)
+            _report_times(report, log.name, open_log(log.path), configuration)
+            _report_allocations(report, log.name, open_log(log.path), configuration)
     return report
 
 
-def _tell_times(report: Report, name: str, log: Log, configuration: Configuration) -> None:
+def _report_times(report: Report, name: str, log: Log, configuration: Configuration) -> None:
     keyframes, readings = _keyframes(log, configuration)
     rounds = []
     for _ in range(1 + _REPEATS):
-        figures = Figures()
-        _measure_maps(keyframes, configuration, figures)
-        _measure_overlaps(keyframes, configuration, figures)
-        _measure_rtl(readings, configuration, figures)
-        _measure_simulation(figures)
-        rounds.append(figures.microseconds())
+        timer = Timer()
+        _measure_maps(keyframes, configuration, timer)
+        _measure_overlaps(keyframes, configuration, timer)
+        _measure_rtl(readings, configuration, timer)
+        _measure_simulation(timer)
+        rounds.append(timer.microseconds())
     # The first round compiles, or loads what was compiled.
-    least = {work: min(taken[work] for taken in rounds[1:]) for work in rounds[0]}
-    report.body += [TIMES, table([name, "[us]"], [[work, f"{taken:.2f}"] for work, taken in least.items()])]
+    least = {work: min(times[work] for times in rounds[1:]) for work in rounds[0]}
+    report.body += [TIMES, table([name, "[us]"], [[work, f"{times:.2f}"] for work, times in least.items()])]
     report.data[f"{name}_us"] = least
 
 
-def _tell_allocations(report: Report, name: str, log: Log, configuration: Configuration) -> None:
+def _report_allocations(report: Report, name: str, log: Log, configuration: Configuration) -> None:
     run_log(log, configuration)
-    with counted() as counts:
+    with count_allocations() as counts:
         run_log(log, configuration)
     report.requirements += requirements_on(counts)
-    text, report.data[f"{name}_arrays"] = told(counts, log.scan_count)
+    text, report.data[f"{name}_arrays"] = describe_counts(counts, log.scan_count)
     report.body += [ALLOCATIONS, text]
 
 
@@ -127,11 +127,11 @@ def _is_due(keyframes: Keyframes, pose: NDArray[np.float64], configuration: Conf
     return far or abs(moved[2]) >= math.radians(settings.keyframe_angle)
 
 
-def _measure_maps(keyframes: Keyframes, configuration: Configuration, figures: Figures) -> None:
+def _measure_maps(keyframes: Keyframes, configuration: Configuration, timer: Timer) -> None:
     """Insertion into the maps of all particles, and matching with them."""
     mapping, count = LocalMapping(configuration), configuration.filter.particles
-    beside = np.zeros((count, 3))
-    beside[:, 1] = _APART * np.arange(count)
+    offsets = np.zeros((count, 3))
+    offsets[:, 1] = _APART * np.arange(count)
     tables = np.stack([mapping.pool.empty_table()] * count)
     first = keyframes[0][1]
     for k, (scan, odometry) in enumerate(keyframes):
@@ -139,11 +139,11 @@ def _measure_maps(keyframes: Keyframes, configuration: Configuration, figures: F
             for table in tables:
                 mapping.pool.release(table)
             first = odometry
-        poses = se2.compose(beside, se2.between(first, odometry))
+        poses = se2.compose(offsets, se2.between(first, odometry))
         if k % _PER_AREA:
-            _measure_matching(mapping, mapping.matching_surfels(scan), tables, poses, figures)
+            _measure_matching(mapping, mapping.matching_surfels(scan), tables, poses, timer)
         beams = len(scan.points) * count
-        figures.timed("insertion, a beam and a map", beams, partial(mapping.insert_scan, tables, poses, scan))
+        timer.add("insertion, a beam and a map", beams, partial(mapping.insert_scan, tables, poses, scan))
 
 
 def _measure_matching(
@@ -151,25 +151,23 @@ def _measure_matching(
     points: NDArray[np.float64],
     tables: NDArray[np.int32],
     poses: NDArray[np.float64],
-    figures: Figures,
+    timer: Timer,
 ) -> None:
     information = np.linalg.inv(np.diag([0.05, 0.05, 0.03]) ** 2)
     view, settings = mapping.pool.view(tables[0]), mapping.configuration.matching
     prior = scan_to_map.Prior(poses[0], information)
-    figures.timed(
-        "Gauss-Newton, a scan", 1, lambda: scan_to_map.align(points, poses[0], prior, view, mapping.alignment)
-    )
-    figures.timed(
+    timer.add("Gauss-Newton, a scan", 1, lambda: scan_to_map.align(points, poses[0], prior, view, mapping.alignment))
+    timer.add(
         "things that moved, a scan",
         1,
         lambda: dynamic_rejection.reject_dynamic(points, prior.mean, prior, view, mapping.alignment),
     )
-    figures.timed(
+    timer.add(
         "likelihood, a point",
         len(points),
         lambda: scan_to_map.log_ratio(points, *poses[0].tolist(), view, mapping.beam_model),
     )
-    figures.timed(
+    timer.add(
         "proposal, a scan and a particle",
         len(poses),
         lambda: scan_to_map.propose_all(
@@ -188,21 +186,21 @@ def _measure_matching(
     )
 
 
-def _measure_overlaps(keyframes: Keyframes, configuration: Configuration, figures: Figures) -> None:
+def _measure_overlaps(keyframes: Keyframes, configuration: Configuration, timer: Timer) -> None:
     """Overlap of each keyframe with those of its area before it."""
     options, reach = configuration.aam, configuration.local_map.max_range
     points = [sensed_points(scan, reach, options.overlap_points) for scan, _ in keyframes]
     poses = np.array([pose for _, pose in keyframes])
     for k in range(1, len(keyframes)):
         before = slice(max(0, k - _PER_AREA), k)
-        figures.timed(
+        timer.add(
             "overlap, a pair of keyframes",
             k - before.start,
             partial(overlaps, points[k], poses[k], points[before], poses[before], options.overlap_radius),
         )
 
 
-def _measure_rtl(readings: list[Odometry], configuration: Configuration, figures: Figures) -> None:
+def _measure_rtl(readings: list[Odometry], configuration: Configuration, timer: Timer) -> None:
     """A pose for every reading, where every third brings a new estimate."""
     process, belief = Rtl(configuration), np.diag([1e-4, 1e-4, 1e-5])
 
@@ -213,10 +211,10 @@ def _measure_rtl(readings: list[Odometry], configuration: Configuration, figures
                 estimate = PoseGaussian(reading.pose, belief)
                 process.handle(LocalEstimate(reading.stamp, k, 0, estimate, reading.pose, 0))
 
-    figures.timed("real-time localisation, an odometry reading", len(readings), play)
+    timer.add("real-time localisation, an odometry reading", len(readings), play)
 
 
-def _measure_simulation(figures: Figures) -> None:
+def _measure_simulation(timer: Timer) -> None:
     scenario = open_simulated("sim:busy").scenario
     numbers = range(0, scenario.scan_stamps.size, 10)
     poses = scenario.true_poses(scenario.scan_stamps)
@@ -226,5 +224,5 @@ def _measure_simulation(figures: Figures) -> None:
         for number in numbers:
             scenario.laser.distances(poses[number : number + 1], scenario.walls, nobody)
 
-    figures.timed("ray casting, a scan of 361 beams", len(numbers), cast_all)
-    figures.timed("simulation, a scan of 361 beams", len(numbers), lambda: [scenario.scan(k) for k in numbers])
+    timer.add("ray casting, a scan of 361 beams", len(numbers), cast_all)
+    timer.add("simulation, a scan of 361 beams", len(numbers), lambda: [scenario.scan(k) for k in numbers])

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
-from benchmark.logs import opened
+from benchmark.logs import open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
@@ -107,14 +107,14 @@ def measure_laps(settings: Settings) -> Report:
     report = Report("laps", "Known ground again and again", seeds=(0,))
     configuration = load_configuration(PARAMETERS, list(settings.changes))
     names = settings.logs_or((*WORLDS, *LOGS))
-    with opened([name for name in names if name not in WORLDS]) as logs:
-        asked: dict[str, tuple[str, Path | None, int]] = {
+    with open_logs([name for name in names if name not in WORLDS]) as logs:
+        jobs: dict[str, tuple[str, Path | None, int]] = {
             name: (f"{SIMULATION_PREFIX}{name},laps={LAPS}", None, LAPS) for name in names if name in WORLDS
         }
-        asked |= {log.name: (str(log.path), log.relations_file, PASSES) for log in logs}
+        jobs |= {log.name: (str(log.path), log.relations_file, PASSES) for log in logs}
         # A process of its own for each: memory is what it takes.
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), max_tasks_per_child=1) as pool:
-            runs = {name: pool.submit(driven, *what, configuration) for name, what in asked.items()}
+            runs = {name: pool.submit(drive_laps, *job, configuration) for name, job in jobs.items()}
             found = {name: run.result() for name, run in runs.items()}
     for name, laps in found.items():
         report.requirements += requirements(name, laps)
@@ -138,7 +138,7 @@ def requirements(name: str, found: Laps) -> list[Requirement]:
     ]
 
 
-def driven(log: str, relations: Path | None, count: int, configuration: Configuration) -> Laps:
+def drive_laps(log: str, relations: Path | None, count: int, configuration: Configuration) -> Laps:
     """Drive over a log ``count`` times, or over a simulated one that has as many laps."""
     gc.freeze()
     source, run = open_log(log), LockStepRun(configuration)
@@ -146,32 +146,32 @@ def driven(log: str, relations: Path | None, count: int, configuration: Configur
     ends = [round(source.scan_count * times * (lap + 1) / count) for lap in range(count)]
     laps: list[Lap] = []
     begin = time.process_time()
-    for record, carried in _passes(source, times):
-        if carried:
+    for record, is_restart in _replay(source, times):
+        if is_restart:
             run.lock_step.feed(PoseReset())
         run.process_record(record)
         run.recorder.compact()
         if isinstance(record.measurement, Scan) and run.scans_read == ends[len(laps)]:
             seconds = time.process_time() - begin
-            laps.append(_lap(run, seconds / (ends[len(laps)] - ([0, *ends][len(laps)]))))
+            laps.append(_measure_lap(run, seconds / (ends[len(laps)] - ([0, *ends][len(laps)]))))
             begin = time.process_time()
     known = None if relations is None else read_relations(relations)
-    return Laps(tuple(laps), tuple(_errors(run, source, known, ends)))
+    return Laps(tuple(laps), tuple(_lap_errors(run, source, known, ends)))
 
 
-def _passes(log: Log, count: int) -> Iterator[tuple[LogRecord, bool]]:
+def _replay(log: Log, count: int) -> Iterator[tuple[LogRecord, bool]]:
     """The records of a log, over and over on one clock, and whether the robot was carried before each."""
     shift = stamp = 0
     for number in range(count):
         for n, record in enumerate(log.records()):
-            again = number > 0 and n == 0
-            if again:
+            is_restart = number > 0 and n == 0
+            if is_restart:
                 shift = stamp + _BETWEEN - record.measurement.stamp
             stamp = record.measurement.stamp + shift
-            yield replace(record, measurement=replace(record.measurement, stamp=stamp)), again
+            yield replace(record, measurement=replace(record.measurement, stamp=stamp)), is_restart
 
 
-def _lap(run: LockStepRun, seconds: float) -> Lap:
+def _measure_lap(run: LockStepRun, seconds: float) -> Lap:
     """What a run is after a lap in which a scan took so many seconds."""
     gc.collect()
     slam = run.lock_step.processes["slam"]
@@ -190,7 +190,7 @@ def _resident() -> int:
     return pages * resource.getpagesize()
 
 
-def _errors(run: LockStepRun, log: Log, known: Relations | None, ends: Sequence[int]) -> Iterator[float]:
+def _lap_errors(run: LockStepRun, log: Log, known: Relations | None, ends: Sequence[int]) -> Iterator[float]:
     """Mean error at the relations of each lap, m.
 
     :param known: those of a log of a real robot; None where its records tell the truth.
@@ -213,7 +213,7 @@ def _table(found: Mapping[str, Laps]) -> str:
     head = ["log", "lap", "areas", "keyframes", "their scans [MB]", "resident [MB]", "recorded [MB]", "hypotheses"]
     rows = []
     for name, run in found.items():
-        for number in _shown(len(run.laps)):
+        for number in _tabulated_laps(len(run.laps)):
             lap = run.laps[number - 1]
             memory = (f"{lap.scan_bytes / 1e6:.1f}", f"{lap.resident / 1e6:.0f}", f"{lap.recorded / 1e6:.1f}")
             figures = [lap.areas, lap.keyframes, *memory]
@@ -222,6 +222,6 @@ def _table(found: Mapping[str, Laps]) -> str:
     return table([*head, "ms a scan", "error [m]"], rows)
 
 
-def _shown(count: int) -> list[int]:
+def _tabulated_laps(count: int) -> list[int]:
     """The laps that stand in the table: the first ones, then every fifth, and the last."""
     return [lap for lap in range(1, count + 1) if lap <= STEADY or lap % 5 == 0 or lap == count]

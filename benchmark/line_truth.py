@@ -19,19 +19,19 @@ _ON = 1e-4  # m, from a wall, of what met it
 _DECIMALS = 6  # of radians and metres: walls that agree to these lie on one line
 
 
-class Seen(NamedTuple):
+class TrueScan(NamedTuple):
     """A scan and what there was to be seen in it.
 
     :ivar scan: as the laser has it, corrected for the true motion during its sweep.
     :ivar lines: shape (n, 2), alpha and r of the lines on which walls and furniture lie, in the robot's frame, rad, m;
         numbered alike at all times at which the furniture stands alike.
-    :ivar met: shape (k,), the line that each beam with a return met, -1 for a person.
+    :ivar hit_lines: shape (k,), the line that each beam with a return met, -1 for a person.
     :ivar ends: shape (k, 2), where it truly ended, m, in that frame.
     """
 
     scan: Scan
     lines: Array
-    met: NDArray[np.int64]
+    hit_lines: NDArray[np.int64]
     ends: Array
 
 
@@ -42,7 +42,7 @@ def lines_of(walls: Array) -> Array:
     return np.stack((se2.wrap(np.where(r < 0.0, alpha + np.pi, alpha)), np.abs(r)), axis=1)
 
 
-def difference(line: Array, other: Array) -> Array:
+def line_difference(line: Array, other: Array) -> Array:
     """other - line, both (..., 2), in that representation of the other whose angle is nearer."""
     turn = se2.wrap(other[..., 0] - line[..., 0])
     opposite = np.abs(turn) > 0.5 * np.pi
@@ -50,7 +50,7 @@ def difference(line: Array, other: Array) -> Array:
     return np.stack((np.where(opposite, se2.wrap(turn - np.pi), turn), away), axis=-1)
 
 
-def seen_in(scenario: Scenario, number: int) -> Seen:
+def true_scan(scenario: Scenario, number: int) -> TrueScan:
     """A scan of a drive by its number, and the truth about it."""
     scan, laser = scenario.scan(number), scenario.laser
     poses = scenario.true_poses(scan.stamp + np.round(1e9 * laser.times).astype(np.int64))
@@ -61,8 +61,8 @@ def seen_in(scenario: Scenario, number: int) -> Seen:
     at_beams = poses[scan.valid] if len(poses) > 1 else poses
     ends = se2.transform(se2.compose(se2.between(poses[0], at_beams), laser.pose), local)
     walls, numbers, lines = _surfaces(scenario, scan.stamp, poses[0])
-    wall = _met(walls, ends)
-    return Seen(scan, lines, np.where(wall < 0, -1, numbers[wall]), ends)
+    wall = _hit_walls(walls, ends)
+    return TrueScan(scan, lines, np.where(wall < 0, -1, numbers[wall]), ends)
 
 
 def true_lines(scenario: Scenario, stamp: int, pose: Array) -> Array:
@@ -80,7 +80,7 @@ def _surfaces(scenario: Scenario, stamp: int, pose: Array) -> tuple[Array, NDArr
     return walls, numbers, lines
 
 
-def _met(walls: Array, ends: Array) -> NDArray[np.int64]:
+def _hit_walls(walls: Array, ends: Array) -> NDArray[np.int64]:
     """The wall (n, 4) on which each point (k, 2) lies, -1 for none."""
     starts, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
     away = ends[:, None] - starts[None]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmark.line_truth import seen_in
+from benchmark.line_truth import true_scan
 from benchmark.lines import walls_of
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
@@ -35,7 +35,7 @@ KINDS = {
 """{name: what it is}."""
 
 
-class Mapped(NamedTuple):
+class LineMapScores(NamedTuple):
     """What a drive came to.
 
     :ivar pose_nees: of the robot's pose, 3 degrees of freedom.
@@ -54,7 +54,7 @@ class Mapped(NamedTuple):
     floor: float
 
 
-def mapped(kind: str, seed: int, laser: str, configuration: Configuration) -> Mapped:
+def map_rooms(kind: str, seed: int, laser: str, configuration: Configuration) -> LineMapScores:
     """Drive through rooms and map them."""
     scenario, floor = drive_in(kind, seed, laser)
     features = replace(configuration.features, range_deviation=scenario.settings.range_noise)
@@ -63,25 +63,25 @@ def mapped(kind: str, seed: int, laser: str, configuration: Configuration) -> Ma
     poses: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
     for number in range(len(scenario.scan_stamps)):
         if number:
-            room.predict(_step(scenario, number, configuration))
-        seen = seen_in(scenario, number)
-        lines = extract_for_map(seen.scan, features)
-        walls, observed = walls_of(lines, seen), room.observe(lines)
+            room.predict(_odometry_step(scenario, number, configuration))
+        scan = true_scan(scenario, number)
+        lines = extract_for_map(scan.scan, features)
+        walls, observed = walls_of(lines, scan), room.observe(lines)
         for k, line in (*observed.matched, *observed.new):
             votes.setdefault(line, Counter())[int(walls[k])] += 1
         for line, part in observed.merged:
             votes[line] += votes.pop(part)
         if number % _EVERY == _EVERY - 1:
-            poses.append(_judged_pose(room, se2.between(start, scenario.poses[number * scenario.settings.readings])))
+            poses.append(_pose_scores(room, se2.between(start, scenario.poses[number * scenario.settings.readings])))
     strays = sum(votes[known.number].most_common(1)[0][0] < 0 for known in room.walls)
     stored = sum(8 + 8 * len(wall.segments) for wall in room.walls)
     size = room.mean.size
     sizes = stored, stored + 4 * (size * (size + 1) // 2)
     pose_nees, sigmas, errors = (np.array(column) for column in zip(*poses, strict=True))
-    return Mapped(pose_nees, sigmas, errors, strays, sizes, floor)
+    return LineMapScores(pose_nees, sigmas, errors, strays, sizes, floor)
 
 
-def _step(scenario: Scenario, number: int, configuration: Configuration) -> RelativeMotion:
+def _odometry_step(scenario: Scenario, number: int, configuration: Configuration) -> RelativeMotion:
     """What odometry says of the motion to a scan."""
     readings = scenario.settings.readings
     before, here = scenario.odometry[(number - 1) * readings], scenario.odometry[number * readings]
@@ -89,7 +89,7 @@ def _step(scenario: Scenario, number: int, configuration: Configuration) -> Rela
     return RelativeMotion(increment, increment_covariance(increment, configuration.motion))
 
 
-def _judged_pose(room: LineMap, truth: NDArray[np.float64]) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+def _pose_scores(room: LineMap, truth: NDArray[np.float64]) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """NEES of the robot's pose, its deviations and its error."""
     belief = room.pose
     error = se2.log(se2.between(belief.mean, truth))
@@ -105,14 +105,14 @@ def drive_in(kind: str, seed: int, settings: str) -> tuple[Scenario, float]:
     draw = random_stream(seed, Purpose.BUILDING, 1)
     first = (0.0, 0.0, draw.uniform(4.5, 7.5), draw.uniform(4.0, 6.0))
     rooms, plan = [first], FloorPlan()
-    way = _around(first)
+    way = _loop_around(first)
     if kind != "room":
         left = first[2] + _WALL
         second = (left, draw.uniform(-1.0, 0.0), left + draw.uniform(4.0, 6.0), draw.uniform(3.8, 5.5))
         rooms.append(second)
         low = max(first[1], second[1]) + _INSET - 0.5 * _DOOR
         plan.cut_rectangle(first[2] - 0.05, low, left + 0.05, low + _DOOR)
-        way = _through(way, _around(second), low + 0.5 * _DOOR)
+        way = _through_door(way, _loop_around(second), low + 0.5 * _DOOR)
     # A door in the first room's upper wall, and what is seen of the corridor behind it.
     door = draw.uniform(0.5, first[2] - 0.5 - _DOOR)
     plan.cut_rectangle(door, first[3] - 0.05, door + _DOOR, first[3] + _WALL + 0.05)
@@ -131,13 +131,13 @@ def _settings(kind: str, seed: int, settings: str) -> Settings:
     return chosen_settings({}, {"seed": seed, "speed": 0.4, **own, **given})
 
 
-def _around(room: Rectangle) -> list[Point]:
+def _loop_around(room: Rectangle) -> list[Point]:
     """Once around a room, from its lower right corner on, counter-clockwise."""
     x0, y0, x1, y1 = room[0] + _INSET, room[1] + _INSET, room[2] - _INSET, room[3] - _INSET
     return [(x1, y0), (x1, y1), (x0, y1), (x0, y0), (x1, y0)]
 
 
-def _through(first: list[Point], second: list[Point], y: float) -> list[Point]:
+def _through_door(first: list[Point], second: list[Point], y: float) -> list[Point]:
     """Around the first room, through the door at ``y`` in its right wall, around the second and back."""
     x = 0.5 * (first[0][0] + second[2][0])
     into = [(first[0][0], y), (x, y), (second[2][0], y)]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmark.line_truth import Seen, difference, seen_in
+from benchmark.line_truth import TrueScan, line_difference, true_scan
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_lines
@@ -34,24 +34,24 @@ class Line(NamedTuple):
     r: float
 
 
-class Scanned(NamedTuple):
+class ScanLines(NamedTuple):
     """What was found in one scan.
 
     :ivar lines: those that have a wall.
     :ivar strays: number of those on none.
-    :ivar shown: length of the walls that beams met, m.
-    :ivar found: what of it is on lines, m.
+    :ivar visible_length: length of the walls that beams met, m.
+    :ivar found_length: what of it is on lines, m.
     :ivar seconds: of CPU time.
     """
 
     lines: tuple[Line, ...]
     strays: int
-    shown: float
-    found: float
+    visible_length: float
+    found_length: float
     seconds: float
 
 
-def scans_of(world: World, laser: str, features: FeatureParameters) -> Iterator[Scanned]:
+def extract_scans(world: World, laser: str, features: FeatureParameters) -> Iterator[ScanLines]:
     """What is found in scans of a drive.
 
     :param laser: settings that differ from the world's.
@@ -60,38 +60,40 @@ def scans_of(world: World, laser: str, features: FeatureParameters) -> Iterator[
     features = replace(features, range_deviation=scenario.settings.range_noise)
     extract_lines(scenario.scan(0), features)
     for number in np.unique(np.linspace(0, len(scenario.scan_stamps) - 1, _SCANS).astype(np.int64)).tolist():
-        yield _scanned(scenario, number, features)
+        yield _extract_scan(scenario, number, features)
 
 
-def _scanned(scenario: Scenario, number: int, features: FeatureParameters) -> Scanned:
-    seen = seen_in(scenario, number)
+def _extract_scan(scenario: Scenario, number: int, features: FeatureParameters) -> ScanLines:
+    scan = true_scan(scenario, number)
     begin = time.process_time()
-    lines = extract_lines(seen.scan, features)
+    lines = extract_lines(scan.scan, features)
     seconds = time.process_time() - begin
-    walls = walls_of(lines, seen)
-    errors = difference(lines.parameters, seen.lines[walls])
+    walls = walls_of(lines, scan)
+    errors = line_difference(lines.parameters, scan.lines[walls])
     nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(lines.covariances), errors)
     deviations = np.sqrt(np.diagonal(lines.covariances, axis1=1, axis2=2))
     rows = np.column_stack((nees, deviations))[walls >= 0]
-    shown, found = _lengths(lines, walls, seen)
-    return Scanned(tuple(Line(*row) for row in rows.tolist()), int(np.sum(walls < 0)), shown, found, seconds)
+    visible_length, found_length = _wall_lengths(lines, walls, scan)
+    return ScanLines(
+        tuple(Line(*row) for row in rows.tolist()), int(np.sum(walls < 0)), visible_length, found_length, seconds
+    )
 
 
-def walls_of(lines: Lines, seen: Seen) -> NDArray[np.int64]:
+def walls_of(lines: Lines, scan: TrueScan) -> NDArray[np.int64]:
     """The true line of each line, shape (n,), -1 where it has none."""
     walls = np.full(len(lines), -1)
     for k in range(len(lines)):
-        numbers, counts = np.unique(seen.met[lines.labels == k], return_counts=True)
+        numbers, counts = np.unique(scan.hit_lines[lines.labels == k], return_counts=True)
         most = int(np.argmax(counts))
         walls[k] = numbers[most] if 2 * counts[most] >= counts.sum() else -1
     return walls
 
 
-def _lengths(lines: Lines, walls: NDArray[np.int64], seen: Seen) -> tuple[float, float]:
+def _wall_lengths(lines: Lines, walls: NDArray[np.int64], scan: TrueScan) -> tuple[float, float]:
     """Length of walls between neighbouring beams that met the same one, and what of it is on a line of that wall, m."""
-    own = seen.met[1:]
-    same = (own == seen.met[:-1]) & (own >= 0)
-    first, second, own = seen.ends[:-1][same], seen.ends[1:][same], own[same]
+    own = scan.hit_lines[1:]
+    same = (own == scan.hit_lines[:-1]) & (own >= 0)
+    first, second, own = scan.ends[:-1][same], scan.ends[1:][same], own[same]
     middles, lengths = 0.5 * (first + second), np.hypot(*(second - first).T)
     found = np.zeros(len(own), dtype=np.bool_)
     for (begin, end), owner in zip(lines.segments, lines.owners, strict=True):
@@ -101,19 +103,19 @@ def _lengths(lines: Lines, walls: NDArray[np.int64], seen: Seen) -> tuple[float,
     return float(lengths.sum()), float(lengths[found].sum())
 
 
-def mean_nees(drives: Sequence[Sequence[Scanned]]) -> float:
+def mean_nees(drives: Sequence[Sequence[ScanLines]]) -> float:
     """Mean over drives of the mean within each."""
     means = [np.mean(own) for drive in drives if (own := [line.nees for scan in drive for line in scan.lines])]
     return float(np.mean(means)) if means else math.nan
 
 
-def stray_share(drives: Sequence[Sequence[Scanned]]) -> float:
+def stray_share(drives: Sequence[Sequence[ScanLines]]) -> float:
     """Of all lines, those on no wall."""
     strays = sum(scan.strays for drive in drives for scan in drive)
     lines = sum(len(scan.lines) for drive in drives for scan in drive)
     return strays / (lines + strays) if lines + strays else math.nan
 
 
-def milliseconds(drives: Sequence[Sequence[Scanned]]) -> float:
+def mean_milliseconds(drives: Sequence[Sequence[ScanLines]]) -> float:
     """CPU time of a scan, mean."""
     return 1e3 * float(np.mean([scan.seconds for drive in drives for scan in drive]))

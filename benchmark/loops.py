@@ -8,17 +8,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from benchmark.report import Report, Requirement, table
-from benchmark.settings import Settings, by_family, chosen_seeds, records_of
+from benchmark.settings import Settings, chosen_seeds, group_by_family, make_records
 from benchmark.simulated.loops import AWAY, GRACE, OLD, STAY, VIEW
 from benchmark.simulated.records import Record
-from benchmark.simulated.truth import FAR, GREY, NEAR, RADIUS, TURN
+from benchmark.simulated.truth import FAR, NEAR, RADIUS, TOLERANCE, TURN
 from benchmark.simulated.worlds import LONG
 
 MISSED = 0.05
 """Largest share of loops that could be closed and were not."""
 
 POLICY = (
-    f"A closure is true where the keyframes that are said to meet truly are within {(1.0 + GREY) * RADIUS:g} m and in "
+    f"A closure is true where the keyframes that are said to meet truly are within {(1.0 + TOLERANCE) * RADIUS:g} m and in "
     f"sight of each other and their relative pose is right to {NEAR:g} m (to {FAR:g} m where the arc's covariance "
     f"admits the error at 99.9 %) and {TURN:g} degrees, between the two keyframes that truly are nearest to each "
     "other. Every closure that TLCA accepts is judged, also where the robot was known to be there, and also where it "
@@ -43,7 +43,7 @@ TOPOLOGY_POLICY = (
 
 def measure_loops(settings: Settings) -> Report:
     """Map the worlds and compare closures with the truth."""
-    records = records_of(settings)
+    records = make_records(settings)
     report = Report("loops", "Precision and recall of loop closures", seeds=chosen_seeds(settings))
     wrong = [(record, closure) for record in records for closure in record["accepted"] if not closure["right"]]
     report.requirements += [
@@ -56,33 +56,33 @@ def measure_loops(settings: Settings) -> Report:
     return report
 
 
-def closable(records: Sequence[Record]) -> list[Record]:
+def loops_to_close(records: Sequence[Record]) -> list[Record]:
     """All loops that can be closed."""
     return [loop for record in records for loop in record["loops"] if loop["can_be_closed"]]
 
 
 def missed_share(records: Sequence[Record]) -> float:
     """Share of the loops that could be closed and were not in time; NaN where there are none."""
-    loops = closable(records)
+    loops = loops_to_close(records)
     return sum(not loop["in_time"] for loop in loops) / len(loops) if loops else math.nan
 
 
-def distances(records: Sequence[Record]) -> list[float]:
+def closing_distances(records: Sequence[Record]) -> list[float]:
     """Path from the begin of a loop to its acceptance, m, of those that were closed in time."""
-    return [loop["closed_at"] - loop["begin"] for loop in closable(records) if loop["in_time"]]
+    return [loop["closed_at"] - loop["begin"] for loop in loops_to_close(records) if loop["in_time"]]
 
 
 def _table(records: list[Record]) -> str:
     head = ["family", "runs", "closures accepted", "of them false", "precision", "loops to close", "closed in time"]
     head += ["recall", "distance, median [m]", "90 % [m]", "closed late"]
-    rows = [[family, *_cells(own)] for family, own in by_family(records).items()]
-    return table(head, [*rows, ["**all**", *_cells(records)]])
+    rows = [[family, *_loop_cells(own)] for family, own in group_by_family(records).items()]
+    return table(head, [*rows, ["**all**", *_loop_cells(records)]])
 
 
-def _cells(records: list[Record]) -> list[str]:
+def _loop_cells(records: list[Record]) -> list[str]:
     accepted = [closure for record in records for closure in record["accepted"]]
     false = sum(not closure["right"] for closure in accepted)
-    loops, ways = closable(records), distances(records)
+    loops, distances = loops_to_close(records), closing_distances(records)
     late = sum(loop["closed_at"] is not None and not loop["in_time"] for loop in loops)
     return [
         str(len(records)),
@@ -90,10 +90,10 @@ def _cells(records: list[Record]) -> list[str]:
         str(false),
         f"{1.0 - false / len(accepted):.3f}" if accepted else "-",
         str(len(loops)),
-        str(len(ways)),
-        f"{len(ways) / len(loops):.3f}" if loops else "-",
-        f"{np.median(ways):.1f}" if ways else "-",
-        f"{np.percentile(ways, 90):.1f}" if ways else "-",
+        str(len(distances)),
+        f"{len(distances) / len(loops):.3f}" if loops else "-",
+        f"{np.median(distances):.1f}" if distances else "-",
+        f"{np.percentile(distances, 90):.1f}" if distances else "-",
         str(late),
     ]
 
@@ -121,22 +121,22 @@ def _wrong_table(wrong: list[tuple[Record, Record]]) -> str:
 
 def measure_topology(settings: Settings) -> Report:
     """Map the worlds and judge how they end."""
-    records = records_of(settings, WORLDS, others=(LONG,))
+    records = make_records(settings, WORLDS, others=(LONG,))
     report = Report("topology", "Exact topology of nested loops", seeds=chosen_seeds(settings))
-    inexact = [record for record in records if faults(record)]
+    inexact = [record for record in records if find_faults(record)]
     share = len(inexact) / len(records)
     report.requirements.append(Requirement("runs that do not end with the exact topology, share", share, INEXACT))
-    rows = [[record["world"], "; ".join(faults(record))] for record in inexact]
-    counted = f"{len(records) - len(inexact)} of {len(records)} runs end with the exact topology."
-    report.body += [counted, *([table(["run", "what is not exact"], rows)] if rows else []), TOPOLOGY_POLICY]
-    report.data["faults"] = {record["world"]: faults(record) for record in records}
+    rows = [[record["world"], "; ".join(find_faults(record))] for record in inexact]
+    summary = f"{len(records) - len(inexact)} of {len(records)} runs end with the exact topology."
+    report.body += [summary, *([table(["run", "what is not exact"], rows)] if rows else []), TOPOLOGY_POLICY]
+    report.data["faults"] = {record["world"]: find_faults(record) for record in records}
     return report
 
 
-def faults(record: Record) -> list[str]:
+def find_faults(record: Record) -> list[str]:
     """What is not exact in the topology that a run ended with."""
     accepted = sum(not closure["right"] for closure in record["accepted"])
     pending = sum(not closure["right"] for closure in record["pending"])
-    unclosed = sum(loop["closed_at"] is None for loop in closable([record]))
-    told = {"closures accepted falsely": accepted, "false closures pending": pending, "loops not closed": unclosed}
-    return [f"{name}: {count}" for name, count in told.items() if count]
+    unclosed = sum(loop["closed_at"] is None for loop in loops_to_close([record]))
+    counts = {"closures accepted falsely": accepted, "false closures pending": pending, "loops not closed": unclosed}
+    return [f"{name}: {count}" for name, count in counts.items() if count]

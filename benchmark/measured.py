@@ -19,7 +19,7 @@ import time
 _PR_SET_PDEATHSIG = 1
 
 
-def measured(command: list[str]) -> dict[str, float]:
+def measure_cost(command: list[str]) -> dict[str, float]:
     """Exit status, CPU seconds (user and system, with all children), wall seconds and largest resident bytes."""
     begin = time.monotonic()
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=sys.stderr)
@@ -39,4 +39,4 @@ def measured(command: list[str]) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(measured(sys.argv[1:])))
+    print(json.dumps(measure_cost(sys.argv[1:])))

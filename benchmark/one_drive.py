@@ -18,7 +18,7 @@ from hmt_slam_ros.simulation import SimulatedLog
 _PAUSE = 2 * NANOSECONDS
 
 
-class OneDrive:
+class JoinedVisits:
     """Visits of a robot that stays where it is in between, and turns to where it begins.
 
     :ivar name: of the first visit.

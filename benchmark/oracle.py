@@ -123,14 +123,14 @@ class Drive(NamedTuple):
     :ivar world: where, its name.
     :ivar distances: {number of hypotheses: total variation distance after every cut that counts}.
     :ivar topologies: how many the enumeration followed at most.
-    :ivar lost: probability that it did not follow, at most.
+    :ivar dropped: probability that it did not follow, at most.
     """
 
     regime: str
     world: str
     distances: dict[int, list[float]]
     topologies: int
-    lost: float
+    dropped: float
 
 
 def measure_oracle(settings: Settings) -> Report:
@@ -141,7 +141,7 @@ def measure_oracle(settings: Settings) -> Report:
     rows, pictured = [], {}
     for regime in REGIMES:
         drives = [
-            compared(regime, world, seed, noise, settings.changes)
+            compare_drive(regime, world, seed, noise, settings.changes)
             for world in regime.worlds
             for noise in regime.noises
             for seed in seeds
@@ -149,8 +149,8 @@ def measure_oracle(settings: Settings) -> Report:
         means = pictured[regime.name] = mean_distances(drives)
         if regime.required:
             report.requirements += oracle_requirements(regime.name, means, usual)
-        rows += [_row(regime.name, world, [d for d in drives if d.world == world]) for world in regime.worlds]
-        rows.append(_row(regime.name, "all", drives))
+        rows += [_table_row(regime.name, world, [d for d in drives if d.world == world]) for world in regime.worlds]
+        rows.append(_table_row(regime.name, "all", drives))
         report.data[regime.name] = [drive._asdict() for drive in drives]
     head = ["scans and odometry", "world", "drives", "cuts", "topologies at most", *(f"N = {n}" for n in HYPOTHESES)]
     report.body += [table(head, rows), POLICY]
@@ -159,7 +159,7 @@ def measure_oracle(settings: Settings) -> Report:
     return report
 
 
-def stops(world: str, seed: int, noise: float) -> list[Stop]:
+def drive_stops(world: str, seed: int, noise: float) -> list[Stop]:
     """A drive along the whole route of a simulated world.
 
     :param noise: factor on the deviations of the odometry.
@@ -181,53 +181,53 @@ def stops(world: str, seed: int, noise: float) -> list[Stop]:
     ]
 
 
-def compared(regime: Regime, world: str, seed: int, noise: float, changes: Sequence[str]) -> Drive:
+def compare_drive(regime: Regime, world: str, seed: int, noise: float, changes: Sequence[str]) -> Drive:
     """Enumerate a drive, and run TSBI on it with every number of hypotheses.
 
     :param changes: parameters that differ from the file, beside those of the regime.
     """
     changes = (*regime.changes, *changes)
-    drive = stops(f"sim:{WORLDS[world]},seed={seed}", seed, noise)
+    drive = drive_stops(f"sim:{WORLDS[world]},seed={seed}", seed, noise)
     enumeration = Enumeration(_configuration(changes), noise)
-    exact, counts, most = [], [], 1
+    exact, counts, most_topologies = [], [], 1
     for stop in drive:
         pmf = enumeration.keyframe(*stop)
         if stop.cut:
             exact.append(pmf)
-            counts.append(enumeration.asked)
-            most = max(most, enumeration.followed)
+            counts.append(enumeration.has_candidates)
+            most_topologies = max(most_topologies, enumeration.topology_count)
     distances = {}
     for hypotheses in HYPOTHESES:
-        found = filtered(drive, _configuration((*changes, f"tsbi.max_hypotheses={hypotheses}")), noise)
+        pmfs = run_tsbi(drive, _configuration((*changes, f"tsbi.max_hypotheses={hypotheses}")), noise)
         distances[hypotheses] = [
-            total_variation(p, q) for p, q, asked in zip(exact, found, counts, strict=True) if asked
+            total_variation(p, q) for p, q, is_counted in zip(exact, pmfs, counts, strict=True) if is_counted
         ]
-    return Drive(regime.name, world, distances, most, enumeration.lost)
+    return Drive(regime.name, world, distances, most_topologies, enumeration.dropped)
 
 
 def _configuration(changes: Sequence[str]) -> Configuration:
     return load_configuration(PARAMETERS, ["tsbi.recheck_keyframes=1000", *changes])
 
 
-def filtered(drive: Sequence[Stop], configuration: Configuration, noise: float) -> list[dict[Visits, float]]:
+def run_tsbi(drive: Sequence[Stop], configuration: Configuration, noise: float) -> list[dict[Visits, float]]:
     """TSBI's PMF after every cut; the sum lacks what it did not examine or dropped."""
     script = Script(Tsbi(configuration), noise=noise)
     paths: dict[int, tuple[Visits, dict[int, int]]] = {FIRST_HYPOTHESIS: ((0,), {0: 0})}
-    found = []
+    pmfs = []
     for stop in drive:
-        leaves = script.keyframe(*stop).hypotheses
+        hypotheses = script.keyframe(*stop).hypotheses
         before, paths = paths, {}
         pmf: dict[Visits, float] = defaultdict(float)
-        for leaf in leaves:
-            path, named = before[leaf.parent]
+        for hypothesis in hypotheses:
+            path, named = before[hypothesis.parent]
             if stop.cut:
-                named = {leaf.area: len(path), **named}
-                path = (*path, named[leaf.area])
-            paths[leaf.id] = path, named
-            pmf[path] += leaf.probability
+                named = {hypothesis.area: len(path), **named}
+                path = (*path, named[hypothesis.area])
+            paths[hypothesis.id] = path, named
+            pmf[path] += hypothesis.probability
         if stop.cut:
-            found.append(dict(pmf))
-    return found
+            pmfs.append(dict(pmf))
+    return pmfs
 
 
 def total_variation(exact: Mapping[Visits, float], found: Mapping[Visits, float]) -> float:
@@ -254,7 +254,7 @@ def oracle_requirements(regime: str, means: Mapping[int, float], usual: int) -> 
     ]
 
 
-def _row(regime: str, world: str, drives: Sequence[Drive]) -> list[str]:
+def _table_row(regime: str, world: str, drives: Sequence[Drive]) -> list[str]:
     cuts = sum(len(drive.distances[HYPOTHESES[0]]) for drive in drives)
     most = max(drive.topologies for drive in drives)
     means = [f"{mean:.4f}" for mean in mean_distances(drives).values()]
@@ -273,7 +273,7 @@ class _EverywhereSearch(ClosureSearch):
         hybrid_map: HybridMap,
         area: int,
         query: Query,
-        compared: Mapping[int, Collection[int]],
+        compare_drive: Mapping[int, Collection[int]],
         excluded: Collection[int],
         most: int,
         only: Collection[int] = (),
@@ -281,15 +281,15 @@ class _EverywhereSearch(ClosureSearch):
         """As in the model, over all areas, however many they are."""
         del most, only
         options = self._options
-        fresh = {
-            known: {k: pose for k, pose in query.poses.items() if k not in compared.get(known, ())}
+        unmatched = {
+            known: {k: pose for k, pose in query.poses.items() if k not in compare_drive.get(known, ())}
             for known in hybrid_map.area_ids()
             if known not in excluded
         }
         beliefs = shortest_path_beliefs(hybrid_map, area)
-        asked = [known for known, own in fresh.items() if 2 * len(own) >= len(query.poses)]
-        priors = {known: self.gating.prior(beliefs[known], query) for known in asked}
-        candidates = {known: AreaCandidate(prior, fresh[known], 1.0) for known, prior in priors.items()}
+        candidates_by_prior = [known for known, own in unmatched.items() if 2 * len(own) >= len(query.poses)]
+        priors = {known: self.gating.prior(beliefs[known], query) for known in candidates_by_prior}
+        candidates = {known: AreaCandidate(prior, unmatched[known], 1.0) for known, prior in priors.items()}
         places = {known: self._grid_cache.place(hybrid_map, known, excluded) for known in candidates}
         entries = {known: self._entry_probability(place, candidates[known]) for known, place in places.items()}
         shares = {known: found.probability for known, found in entries.items() if found.probability}
@@ -311,9 +311,9 @@ class _EverywhereSearch(ClosureSearch):
                 (1.0 - new) * share / total,
             )
         ]
-        beside = tuple(known for known, found in modes.items() if found is None)
-        examined = tuple(known for known in shares if known not in beside)
-        return AreaComparison(Transition({}, new), tuple(fits), examined, beside, 0.0)
+        beside_areas = tuple(known for known, found in modes.items() if found is None)
+        examined = tuple(known for known in shares if known not in beside_areas)
+        return AreaComparison(Transition({}, new), tuple(fits), examined, beside_areas, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,21 +328,21 @@ class _Topology:
     path: Visits
     named: dict[int, int]
     hybrid_map: HybridMap
-    notes: HypothesisState
+    state: HypothesisState
     robot: Robot
     log_weight: float
 
     @property
     def parent(self) -> Parent:
         """The hypothesis that it is at the next event."""
-        return Parent(FIRST_HYPOTHESIS, self.robot.area, self.hybrid_map, self.notes, self.log_weight)
+        return Parent(FIRST_HYPOTHESIS, self.robot.area, self.hybrid_map, self.state, self.log_weight)
 
 
 class Enumeration:
     """All topologies of a drive.
 
-    :ivar lost: probability of the topologies that were not followed any further, at most.
-    :ivar asked: whether there was a known area so far that the robot could be in, by the arcs.
+    :ivar dropped: probability of the topologies that were not followed any further, at most.
+    :ivar has_candidates: whether there was a known area so far that the robot could be in, by the arcs.
     """
 
     def __init__(self, configuration: Configuration, noise: float = 1.0) -> None:
@@ -353,11 +353,11 @@ class Enumeration:
         self._branching.search = _EverywhereSearch(configuration, self._replica.scans)
         self._topologies = [_Topology((0,), {0: 0}, HybridMap(), HypothesisState(), Robot(), 0.0)]
         self._sequence = -1
-        self.lost = 0.0
-        self.asked = False
+        self.dropped = 0.0
+        self.has_candidates = False
 
     @property
-    def followed(self) -> int:
+    def topology_count(self) -> int:
         """How many topologies there are now."""
         return len(self._topologies)
 
@@ -367,25 +367,25 @@ class Enumeration:
         self._replica.scans[self._sequence] = scan
         self._branching.begin_event()
         points = self._branching.search.surface_points(scan)
-        noted = [self._recognized(self._noted(topology, step), points) for topology in self._topologies]
+        topologies = [self._reweight(self._add_keyframe(topology, step), points) for topology in self._topologies]
         if cut:
             newest = range(self._sequence + 1 - cut, self._sequence + 1)
-            noted = [child for topology in noted for child in self._children(topology, newest)]
-        self._topologies = self._normalised(noted)
+            topologies = [child for topology in topologies for child in self._children(topology, newest)]
+        self._topologies = self._normalize(topologies)
         pmf: dict[Visits, float] = defaultdict(float)
         for topology in self._topologies:
             pmf[topology.path] += math.exp(topology.log_weight)
         return dict(pmf)
 
-    def _noted(self, topology: _Topology, step: Float64) -> _Topology:
+    def _add_keyframe(self, topology: _Topology, step: Float64) -> _Topology:
         """After the robot stored the newest keyframe in its area."""
-        robot = topology.robot.moved(step, self._noise)
+        robot = topology.robot.move(step, self._noise)
         topology.hybrid_map.set_keyframe(self._sequence, robot.area, robot.pose.mean)
         return replace(
-            topology, robot=robot, notes=topology.notes.after_keyframe(self._sequence, robot.pose.covariance)
+            topology, robot=robot, state=topology.state.after_keyframe(self._sequence, robot.pose.covariance)
         )
 
-    def _recognized(self, topology: _Topology, points: Float64) -> _Topology:
+    def _reweight(self, topology: _Topology, points: Float64) -> _Topology:
         """Weighed by what the newest scan says for the known ground that the robot is in."""
         pose = topology.robot.pose.mean
         found = self._branching.reweight_by_known_ground(topology.parent, pose, points, self._sequence)
@@ -393,24 +393,24 @@ class Enumeration:
 
     def _children(self, topology: _Topology, newest: Sequence[int]) -> Iterator[_Topology]:
         branches = self._branching.cut(topology.parent, newest)
-        self.asked |= any(child.state.matched_keyframes for child in branches.children)
+        self.has_candidates |= any(child.state.matched_keyframes for child in branches.children)
         for child in branches.children:
-            yield self._followed(topology, child)
+            yield self._continue(topology, child)
 
-    def _followed(self, topology: _Topology, child: Child) -> _Topology:
+    def _continue(self, topology: _Topology, child: Child) -> _Topology:
         hybrid_map = topology.hybrid_map.branch()
         self._replica.apply_changes(hybrid_map, child.moved_keyframes, child.arcs)
         around = areas_around(hybrid_map, child.area, self._branching.search.submap_radius)
         local = {area: belief.mean for area, belief in around.items() if area != child.area}
         named = {child.area: len(topology.path), **topology.named}
-        robot = topology.robot.entered(child.area, child.frame_change, len(child.moved_keyframes), self._noise)
+        robot = topology.robot.enter(child.area, child.frame_change, len(child.moved_keyframes), self._noise)
         path = (*topology.path, named[child.area])
         return _Topology(path, named, hybrid_map, replace(child.state, local_area_poses=local), robot, child.log_weight)
 
-    def _normalised(self, topologies: Sequence[_Topology]) -> list[_Topology]:
+    def _normalize(self, topologies: Sequence[_Topology]) -> list[_Topology]:
         total = float(np.logaddexp.reduce([topology.log_weight for topology in topologies]))
         kept = [topology for topology in topologies if topology.log_weight - total > math.log(NEGLIGIBLE)]
-        self.lost += NEGLIGIBLE * (len(topologies) - len(kept))
+        self.dropped += NEGLIGIBLE * (len(topologies) - len(kept))
         return [replace(topology, log_weight=topology.log_weight - total) for topology in kept]
 
 

@@ -17,8 +17,8 @@ from std_msgs.msg import String
 
 from benchmark.driven_run import DrivenRun
 from benchmark.explore import is_within
-from benchmark.institute import AT_PLACE, known_of
-from benchmark.institute_maps import LASER, PEOPLE, charted, scenario_of
+from benchmark.institute import AT_PLACE, known_building
+from benchmark.institute_maps import LASER, PEOPLE, chart_map, scenario_of
 from benchmark.live import PROCESSES
 from benchmark.report import Report, Requirement, table
 from benchmark.running_nodes import Listener, Parameters
@@ -62,10 +62,10 @@ POLICY = (
 RATE = 2.0
 """Times real time at most; the robot waits for slam."""
 
-_PATIENCE = 900.0  # s, for an errand, and a node that compiles
+_TIMEOUT = 900.0  # s, for an errand, and a node that compiles
 
 
-class Explored(NamedTuple):
+class ExploredBuilding(NamedTuple):
     """A building and its saved map.
 
     :ivar seed: of the building.
@@ -80,79 +80,79 @@ class Explored(NamedTuple):
     rooms: dict[str, tuple[int, Float64]]
 
 
-class Scored(NamedTuple):
+class TaskScore(NamedTuple):
     """An errand.
 
     :ivar seed: of the building.
-    :ivar ran: what happened.
-    :ivar off: distance from the room's place at the end, m.
+    :ivar run: what happened.
+    :ivar error: distance from the room's place at the end, m.
     :ivar starts: errors of what slam was told, m and rad.
     """
 
     seed: int
-    ran: Ran
-    off: float
+    run: TaskRun
+    error: float
     starts: list[tuple[float, float]]
 
     @property
     def reached(self) -> bool:
         """Whether the robot is there, as the pilot says."""
-        return self.ran.text.endswith(": the robot is there") and self.off <= AT_PLACE
+        return self.run.text.endswith(": the robot is there") and self.error <= AT_PLACE
 
 
 def measure_pilot(settings: Settings) -> Report:
     """Explore, save the maps, and send the pilot to rooms."""
     seeds = chosen_seeds(settings, SEEDS)
     configuration = load_configuration(PARAMETERS, list(settings.changes))
-    explore = partial(explored, configuration=configuration, out=settings.out)
+    explore = partial(explore_building, configuration=configuration, out=settings.out)
     with ProcessPoolExecutor(settings.records.jobs) as pool:
         buildings = list(pool.map(explore, seeds))
-    errands = [one for building in buildings for one in errands_in(building)]
+    scores = [score for building in buildings for score in run_tasks(building)]
     report = Report("pilot", "Errands of the pilot through nodes", seeds=seeds)
-    report.requirements = requirements(errands)
-    report.body += [_table(errands), POLICY]
+    report.requirements = requirements(scores)
+    report.body += [_table(scores), POLICY]
     return report
 
 
-def explored(seed: int, configuration: Configuration, out: Path) -> Explored:
+def explore_building(seed: int, configuration: Configuration, out: Path) -> ExploredBuilding:
     """Let the explorer explore a building, and save its map.
 
     :param out: where the folder of the map is made.
     :raises HmtSlamError: where it comes to no end.
     """
     run = DrivenRun(DrivenRobot(scenario_of(seed)), configuration, Explorer(configuration))
-    if run.do(Task("explore"), _EXPLORATION) is None:
+    if run.run_task(Task("explore"), _EXPLORATION) is None:
         raise HmtSlamError(f"the explorer came to no end in {_EXPLORATION:g} s: see python -m benchmark explore")
     folder = out / f"map{seed}"
     recording = run.save(folder, configuration)
-    institute = charted(
+    institute = chart_map(
         run.robot.scenario, recording.hybrid_map, recording.replica.scans, run.robot.true_poses, configuration
     )
     frames = {area: (pose.mean, institute.frames[area]) for area, pose in recording.area_poses.items()}
     places = {
         name: (room.opening.area, se2.transform(frames[room.opening.area][1], room.position[None])[0])
-        for name, room in named_destinations(known_of(institute, configuration)).items()
+        for name, room in named_destinations(known_building(institute, configuration)).items()
     }
-    return Explored(seed, folder, frames, places)
+    return ExploredBuilding(seed, folder, frames, places)
 
 
-def errands_in(building: Explored) -> list[Scored]:
+def run_tasks(building: ExploredBuilding) -> list[TaskScore]:
     """Send the robot to rooms drawn by chance, never twice in a row to the same."""
     draw = np.random.default_rng([building.seed, 3])
     world = f"sim:institute,seed={building.seed},visit=1,changed=0,laps=1,people={PEOPLE},{LASER}"
-    scored: list[Scored] = []
+    scored: list[TaskScore] = []
     with ExitStack() as stack:
-        start = Start(world, _awakening(world, draw), building.folder)
-        errands = Errands(stack, stack.enter_context(Listener()), start)
+        start = Start(world, _draw_start(world, draw), building.folder)
+        session = PilotSession(stack, stack.enter_context(Listener()), start)
         last = ""
         for _ in range(PER_BUILDING):
             others = [name for name in building.rooms if name != last]
             last = others[int(draw.integers(len(others)))]
-            scored.append(_scored(building, errands.run(last), last))
+            scored.append(_score_task(building, session.run(last), last))
     return scored
 
 
-def _awakening(world: str, draw: np.random.Generator) -> float:
+def _draw_start(world: str, draw: np.random.Generator) -> float:
     """Seconds from the beginning of the scripted drive to a time at which the robot is in a hallway."""
     simulated = open_simulated(world)
     inside = True
@@ -163,49 +163,51 @@ def _awakening(world: str, draw: np.random.Generator) -> float:
     return seconds
 
 
-def _scored(building: Explored, ran: Ran, room: str) -> Scored:
+def _score_task(building: ExploredBuilding, run: TaskRun, room: str) -> TaskScore:
     """An errand against what is true."""
     area, place = building.rooms[room]
     in_map, in_world = building.frames[area]
     starts = []
-    for told, true in ran.starts:
-        off = se2.between(se2.compose(in_world, se2.between(in_map, told)), true)
-        starts.append((math.hypot(off[0], off[1]), abs(float(off[2]))))
-    return Scored(building.seed, ran, math.dist(place, ran.path[-1]), starts)
+    for given, true in run.starts:
+        error = se2.between(se2.compose(in_world, se2.between(in_map, given)), true)
+        starts.append((math.hypot(error[0], error[1]), abs(float(error[2]))))
+    return TaskScore(building.seed, run, math.dist(place, run.path[-1]), starts)
 
 
-def requirements(errands: Sequence[Scored]) -> list[Requirement]:
+def requirements(scores: Sequence[TaskScore]) -> list[Requirement]:
     """What is asked of errands."""
-    starts = [off for one in errands for off, _ in one.starts]
-    metres, seconds = sum(one.ran.metres for one in errands), sum(one.ran.seconds for one in errands)
-    told = [Requirement("initialpose: largest error", max(starts), _START, "m")] if starts else []
+    starts = [error for score in scores for error, _ in score.starts]
+    distance, seconds = sum(score.run.distance for score in scores), sum(score.run.seconds for score in scores)
+    start_requirements = [Requirement("initialpose: largest error", max(starts), _START, "m")] if starts else []
     return [
-        Requirement("errands that reach their place", float(np.mean([one.reached for one in errands])), 1.0, least=1.0),
-        Requirement("contacts", float(sum(one.ran.contacts for one in errands)), 0.0),
-        Requirement("mean speed", metres / max(1e-9, seconds), math.inf, "m/s", least=_SPEED),
-        *told,
+        Requirement(
+            "errands that reach their place", float(np.mean([score.reached for score in scores])), 1.0, least=1.0
+        ),
+        Requirement("contacts", float(sum(score.run.contacts for score in scores)), 0.0),
+        Requirement("mean speed", distance / max(1e-9, seconds), math.inf, "m/s", least=_SPEED),
+        *start_requirements,
     ]
 
 
-def _table(errands: Sequence[Scored]) -> str:
+def _table(scores: Sequence[TaskScore]) -> str:
     head = ["building", "errand", "how it ended", "off [m]", "way [m]", "time [s]", "contacts"]
     head += ["initialpose off [m]", "[deg]"]
-    return table(head, [_row(one) for one in errands])
+    return table(head, [_task_row(score) for score in scores])
 
 
-def _row(one: Scored) -> list[str]:
-    errand, _, end = one.ran.text.partition(": ")
-    far, turned = (max((start[k] for start in one.starts), default=math.nan) for k in (0, 1))
-    told = [f"{far:.2f}", f"{math.degrees(turned):.1f}"] if one.starts else ["-", "-"]
+def _task_row(score: TaskScore) -> list[str]:
+    task, _, result = score.run.text.partition(": ")
+    far, turned = (max((start[k] for start in score.starts), default=math.nan) for k in (0, 1))
+    start_errors = [f"{far:.2f}", f"{math.degrees(turned):.1f}"] if score.starts else ["-", "-"]
     return [
-        str(one.seed),
-        errand,
-        end,
-        f"{one.off:.2f}",
-        f"{one.ran.metres:.0f}",
-        f"{one.ran.seconds:.0f}",
-        str(one.ran.contacts),
-        *told,
+        str(score.seed),
+        task,
+        result,
+        f"{score.error:.2f}",
+        f"{score.run.distance:.0f}",
+        f"{score.run.seconds:.0f}",
+        str(score.run.contacts),
+        *start_errors,
     ]
 
 
@@ -222,7 +224,7 @@ class Start(NamedTuple):
     folder: Path
 
 
-class Ran(NamedTuple):
+class TaskRun(NamedTuple):
     """What came of an errand.
 
     :ivar text: how the pilot says that it ended.
@@ -239,33 +241,33 @@ class Ran(NamedTuple):
     starts: list[tuple[Float64, Float64]]
 
     @property
-    def metres(self) -> float:
+    def distance(self) -> float:
         """Way of the robot."""
         return float(np.hypot(*np.diff(self.path, axis=0).T).sum())
 
 
-class Errands:
+class PilotSession:
     """The nodes, and what they say."""
 
     def __init__(self, stack: ExitStack, listener: Listener, start: Start) -> None:
         """Start them; they end with the stack."""
         self._listener = listener
-        self._outcomes: list[str] = []
+        self._results: list[str] = []
         self._truths: dict[int, Float64] = {}
         self._starts: list[tuple[int, Float64]] = []
         self._contacts, self._reports = 0, 0
         node = listener.node
         node.create_subscription(
-            String, TASK_RESULTS["pilot"], lambda message: self._outcomes.append(message.data), topics.LATCHED
+            String, TASK_RESULTS["pilot"], lambda message: self._results.append(message.data), topics.LATCHED
         )
-        node.create_subscription(PoseStamped, GROUND_TRUTH, self._hear_truth, topics.STREAM)
-        node.create_subscription(PoseWithCovarianceStamped, INITIAL_POSE, self._hear_start, topics.STREAM)
-        node.create_subscription(DiagnosticArray, DIAGNOSTICS, self._hear_diagnostics, topics.STREAM)
-        self._errands = node.create_publisher(String, TASK_GOALS["pilot"], topics.STREAM)
+        node.create_subscription(PoseStamped, GROUND_TRUTH, self._add_truth, topics.STREAM)
+        node.create_subscription(PoseWithCovarianceStamped, INITIAL_POSE, self._add_initial_pose, topics.STREAM)
+        node.create_subscription(DiagnosticArray, DIAGNOSTICS, self._add_diagnostics, topics.STREAM)
+        self._goal_publisher = node.create_publisher(String, TASK_GOALS["pilot"], topics.STREAM)
         shared: Parameters = {"start_from": str(start.folder), "mode": "localization"}
         for name in (*PROCESSES, "pilot"):
             stack.enter_context(listener.running(name, shared))
-        listener.until(lambda: self._errands.get_subscription_count() == 1, _PATIENCE)
+        listener.wait_until(lambda: self._goal_publisher.get_subscription_count() == 1, _TIMEOUT)
         robot: Parameters = {
             "log": start.world,
             "robot.start": start.seconds,
@@ -273,35 +275,42 @@ class Errands:
             "robot.rate": RATE,
             "robot.scan_listeners": 2,
             "robot.odometry_listeners": 3,
-            "robot.discovery_timeout": _PATIENCE,
+            "robot.discovery_timeout": _TIMEOUT,
         }
         stack.enter_context(listener.running("robot", robot))
-        listener.until(lambda: bool(self._truths), _PATIENCE)
+        listener.wait_until(lambda: bool(self._truths), _TIMEOUT)
 
-    def run(self, room: str) -> Ran:
+    def run(self, room: str) -> TaskRun:
         """Go to a room.
 
         :raises HmtSlamError: where the pilot does not say how that ended.
         """
-        ended, begin, starts, contacts = len(self._outcomes), len(self._truths), len(self._starts), self._contacts
-        self._errands.publish(String(data=f"go {room}"))
-        self._listener.until(lambda: len(self._outcomes) > ended, _PATIENCE)
+        result_count, truth_count, start_count, contacts = (
+            len(self._results),
+            len(self._truths),
+            len(self._starts),
+            self._contacts,
+        )
+        self._goal_publisher.publish(String(data=f"go {room}"))
+        self._listener.wait_until(lambda: len(self._results) > result_count, _TIMEOUT)
         reports = self._reports
         # What it counted up to the end is in the second report from now on.
-        self._listener.until(lambda: self._reports >= reports + 2)
-        stamps = list(self._truths)[begin:]
+        self._listener.wait_until(lambda: self._reports >= reports + 2)
+        stamps = list(self._truths)[truth_count:]
         path = np.array([self._truths[stamp][:2] for stamp in stamps])
         seconds = (stamps[-1] - stamps[0]) / NANOSECONDS
-        told = [(pose, self._truths[stamp]) for stamp, pose in self._starts[starts:] if stamp in self._truths]
-        return Ran(self._outcomes[-1], path, seconds, self._contacts - contacts, told)
+        initial_poses = [
+            (pose, self._truths[stamp]) for stamp, pose in self._starts[start_count:] if stamp in self._truths
+        ]
+        return TaskRun(self._results[-1], path, seconds, self._contacts - contacts, initial_poses)
 
-    def _hear_truth(self, message: PoseStamped) -> None:
+    def _add_truth(self, message: PoseStamped) -> None:
         self._truths[stamp_from_time(message.header.stamp)] = pose_from_message(message.pose)
 
-    def _hear_start(self, message: PoseWithCovarianceStamped) -> None:
+    def _add_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         self._starts.append((stamp_from_time(message.header.stamp), pose_from_message(message.pose.pose)))
 
-    def _hear_diagnostics(self, message: DiagnosticArray) -> None:
+    def _add_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name == "/robot":
                 self._reports += 1

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from benchmark.logs import LOGS, WITH_RELATIONS, MeasuredLog, opened
-from benchmark.loops import closable, missed_share
+from benchmark.logs import LOGS, WITH_RELATIONS, MeasuredLog, open_logs
+from benchmark.loops import loops_to_close, missed_share
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import Case, Run
 from benchmark.scoring import POLICY as RELATIONS
@@ -33,7 +33,7 @@ _LOG_SEEDS = 2
 # What is asked of the policies that ask for openings: doors found, portals true, and errors relative to ncut.
 _DOORS, _TRUE, _MISSED, _WORSE = 0.9, 0.9, 0.05, 1.1
 
-TOLD = (
+POLICY = (
     "Doors are the open doors that the path passes, crossings the places where hallways cross; both are counted once, "
     f"and are found where the path changes areas within {NEAR:g} m of the door, or of the crossing's border. Corners "
     "of hallways and halls have openings, too, which are no doors: so a portal is true where there is any gap between "
@@ -52,15 +52,15 @@ def measure_policies(settings: Settings) -> Report:
     report = Report("policies", "Where areas end: at cuts, at doors, or both", seeds=seeds)
     families = [name for name in FAMILIES if name in names]
     if families:
-        records = {policy: _records(settings, policy, families, seeds) for policy in POLICIES}
+        records = {policy: _make_records(settings, policy, families, seeds) for policy in POLICIES}
         report.requirements += [r for policy in POLICIES[1:] for r in requirements(policy, records)]
         report.body.append(_table(records, families))
         report.data["doors"] = {
             policy: {record["world"]: record["doors"] for record in own} for policy, own in records.items()
         }
-    with opened([name for name in names if name in LOGS]) as logs:
+    with open_logs([name for name in names if name in LOGS]) as logs:
         _score(report, settings, logs)
-    report.body.append(TOLD)
+    report.body.append(POLICY)
     return report
 
 
@@ -68,9 +68,9 @@ def _changes(settings: Settings, policy: str) -> tuple[str, ...]:
     return (*settings.changes, f"aam.area_policy={policy}")
 
 
-def _records(settings: Settings, policy: str, families: Sequence[str], seeds: Sequence[int]) -> list[Record]:
+def _make_records(settings: Settings, policy: str, families: Sequence[str], seeds: Sequence[int]) -> list[Record]:
     records = Records(settings.records.folder / policy, settings.records.jobs)
-    return records.of([World(family, seed) for family in families for seed in seeds], _changes(settings, policy))
+    return records.make([World(family, seed) for family in families for seed in seeds], _changes(settings, policy))
 
 
 def requirements(policy: str, records: Mapping[str, Sequence[Record]]) -> list[Requirement]:
@@ -80,30 +80,36 @@ def requirements(policy: str, records: Mapping[str, Sequence[Record]]) -> list[R
     """
     own = records[policy]
     return [
-        Requirement(f"{policy}: doors at which areas end", share(own, "doors", NEAR), 1.0, least=_DOORS),
-        Requirement(f"{policy}: portals that are true", share(own, "portals", PORTAL), 1.0, least=_TRUE),
-        Requirement(f"{policy}: closures accepted falsely", _false(own), 0),
+        Requirement(f"{policy}: doors at which areas end", share_within(own, "doors", NEAR), 1.0, least=_DOORS),
+        Requirement(f"{policy}: portals that are true", share_within(own, "portals", PORTAL), 1.0, least=_TRUE),
+        Requirement(f"{policy}: closures accepted falsely", _count_false(own), 0),
         Requirement(f"{policy}: loops that could be closed and were not, share", missed_share(list(own)), _MISSED),
-        Requirement(f"{policy}: error of the pose / that by ncut", _error(own) / _error(records["ncut"]), _WORSE),
+        Requirement(
+            f"{policy}: error of the pose / that by ncut",
+            _mean_pose_error(own) / _mean_pose_error(records["ncut"]),
+            _WORSE,
+        ),
     ]
 
 
-def share(records: Sequence[Record], kind: str, within: float) -> float:
+def share_within(records: Sequence[Record], kind: str, within: float) -> float:
     """Of all distances of a kind those that are within some, m; NaN where there are none."""
-    apart = _apart(records, kind)
+    apart = _distances(records, kind)
     return float(np.mean(apart <= within)) if apart.size else math.nan
 
 
-def _apart(records: Sequence[Record], kind: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _distances(records: Sequence[Record], kind: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     """Distances, m; a record holds None where there is nothing."""
-    return np.array([math.inf if d is None else d for record in records for d in record["doors"][kind]])
+    return np.array(
+        [math.inf if distance is None else distance for record in records for distance in record["doors"][kind]]
+    )
 
 
-def _false(records: Sequence[Record]) -> int:
+def _count_false(records: Sequence[Record]) -> int:
     return sum(not closure["right"] for record in records for closure in record["accepted"])
 
 
-def _error(records: Sequence[Record]) -> float:
+def _mean_pose_error(records: Sequence[Record]) -> float:
     """Mean error of the pose in the map, m."""
     return float(np.mean([pose["map"]["translation"] for record in records for pose in record["poses"]]))
 
@@ -113,37 +119,37 @@ def _table(records: Mapping[str, Sequence[Record]], families: Sequence[str]) -> 
     head += ["crossings", "found", "portals", "true", "doors with one", "portals' error [m]", "error of the pose [m]"]
     head += ["closures", "false", "loops", "in time"]
     rows = [
-        [family, policy, *_cells([record for record in records[policy] if record["family"] == family])]
+        [family, policy, *_record_cells([record for record in records[policy] if record["family"] == family])]
         for family in families
         for policy in records
     ]
     return table(head, rows)
 
 
-def _cells(records: Sequence[Record]) -> list[str]:
-    portals, loops = _apart(records, "portals"), closable(list(records))
+def _record_cells(records: Sequence[Record]) -> list[str]:
+    portals, loops = _distances(records, "portals"), loops_to_close(list(records))
     right = portals[portals <= PORTAL]
     return [
         str(len(records)),
         f"{np.mean([record['doors']['areas'] for record in records]):.1f}",
-        *_counted(records, "changes", NEAR),
-        *_counted(records, "doors", NEAR),
-        *_counted(records, "crossings", NEAR),
-        *_counted(records, "portals", PORTAL),
-        _counted(records, "doors_portals", PORTAL)[1],
+        *_count_cells(records, "changes", NEAR),
+        *_count_cells(records, "doors", NEAR),
+        *_count_cells(records, "crossings", NEAR),
+        *_count_cells(records, "portals", PORTAL),
+        _count_cells(records, "doors_portals", PORTAL)[1],
         f"{right.mean():.2f}" if right.size else "-",
-        f"{_error(records):.3f}",
+        f"{_mean_pose_error(records):.3f}",
         str(sum(len(record["accepted"]) for record in records)),
-        str(_false(records)),
+        str(_count_false(records)),
         str(len(loops)),
         str(sum(loop["in_time"] for loop in loops)),
     ]
 
 
-def _counted(records: Sequence[Record], kind: str, within: float) -> list[str]:
+def _count_cells(records: Sequence[Record], kind: str, within: float) -> list[str]:
     """How many there are, and which share of them is within a distance."""
-    count = _apart(records, kind).size
-    return [str(count), f"{100.0 * share(records, kind, within):.0f} %" if count else "-"]
+    count = _distances(records, kind).size
+    return [str(count), f"{100.0 * share_within(records, kind, within):.0f} %" if count else "-"]
 
 
 def _score(report: Report, settings: Settings, logs: Sequence[MeasuredLog]) -> None:

@@ -56,11 +56,11 @@ class Requirement:
     @property
     def row(self) -> list[str]:
         """The cells of its line in the table."""
-        return [self.name, _number(self.value, self.unit), self._bounds, "pass" if self.met else "FAIL"]
+        return [self.name, _format_number(self.value, self.unit), self._bounds, "pass" if self.met else "FAIL"]
 
     @property
     def _bounds(self) -> str:
-        least, bound = _number(self.least, self.unit), _number(self.bound, self.unit)
+        least, bound = _format_number(self.least, self.unit), _format_number(self.bound, self.unit)
         if math.isinf(self.least):
             return bound
         return f"at least {least}" if math.isinf(self.bound) else f"{least} to {bound}"
@@ -99,25 +99,25 @@ class Report:
         """Requirements and body as Markdown."""
         rows = [requirement.row for requirement in self.requirements]
         bounds = "at most" if all(math.isinf(requirement.least) for requirement in self.requirements) else "allowed"
-        asked = [table(["required", "measured", bounds, ""], rows)] if rows else []
-        return "\n\n".join([*asked, *self.body])
+        required = [table(["required", "measured", bounds, ""], rows)] if rows else []
+        return "\n\n".join([*required, *self.body])
 
-    def write(self, folder: Path, circumstances: Mapping[str, str]) -> None:
+    def write(self, folder: Path, describe_circumstances: Mapping[str, str]) -> None:
         """Write ``<kind>.md`` and ``<kind>.json``.
 
-        :param circumstances: of the measurement: machine, versions, date.
+        :param describe_circumstances: of the measurement: machine, versions, date.
         """
-        facts = table(["", ""], [[name, value] for name, value in circumstances.items()])
+        facts = table(["", ""], [[name, value] for name, value in describe_circumstances.items()])
         pictures = "\n\n".join(f"![{caption}]({name})\n\n{caption}" for name, caption in self.pictures.items())
         parts = [f"# {self.title}", self.text, pictures, "## Circumstances", facts]
         (folder / f"{self.kind}.md").write_text("\n\n".join(filter(None, parts)) + "\n", encoding="utf-8")
         content = {
             "kind": self.kind,
-            "circumstances": dict(circumstances),
+            "circumstances": dict(describe_circumstances),
             "requirements": [vars(requirement) | {"met": requirement.met} for requirement in self.requirements],
             **self.data,
         }
-        text = json.dumps(_plain(content), indent=1, allow_nan=False)
+        text = json.dumps(_make_json_safe(content), indent=1, allow_nan=False)
         (folder / f"{self.kind}.json").write_text(text + "\n", encoding="utf-8")
 
 
@@ -127,20 +127,20 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in [head, rule, *rows])
 
 
-def _number(value: float, unit: str) -> str:
+def _format_number(value: float, unit: str) -> str:
     return f"{value:.4g} {unit}".strip()
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401  whatever is in a report
+def _make_json_safe(value: Any) -> Any:  # noqa: ANN401  whatever is in a report
     """The same with None for numbers that JSON does not know."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
+        return {str(key): _make_json_safe(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
+        return [_make_json_safe(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def circumstances(seeds: Sequence[int], jobs: int, changes: Sequence[str]) -> dict[str, str]:
+def describe_circumstances(seeds: Sequence[int], jobs: int, changes: Sequence[str]) -> dict[str, str]:
     """Names and values, in the order in which they are shown.
 
     :param seeds: of the runs.
@@ -149,46 +149,48 @@ def circumstances(seeds: Sequence[int], jobs: int, changes: Sequence[str]) -> di
     """
     return {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        "commit": commit(),
-        "machine": f"{_processor()}, {os.cpu_count()} cores, {_memory() / 2**30:.1f} GiB, {platform.system()}",
+        "commit": describe_commit(),
+        "machine": f"{_processor_name()}, {os.cpu_count()} cores, {_memory_bytes() / 2**30:.1f} GiB, {platform.system()}",
         "versions": ", ".join(
             [f"Python {platform.python_version()}", *(f"{name} {version(name)}" for name in _LIBRARIES)]
         ),
         "parameters": f"{PARAMETERS.name}, SHA-256 {hashlib.sha256(PARAMETERS.read_bytes()).hexdigest()[:16]}",
         "changed parameters": ", ".join(changes) or "none",
-        "seeds": _listed(seeds),
+        "seeds": _list_seeds(seeds),
         "runs at a time": str(jobs),
         "environment": ", ".join(f"{name}={os.environ.get(name, 'not set')}" for name in _VARIABLES),
     }
 
 
-def summary(facts: Mapping[str, str]) -> str:
+def summarize_circumstances(facts: Mapping[str, str]) -> str:
     """The most important of them in one sentence."""
     return f"Measured {facts['date']} at commit {facts['commit']} on {facts['machine']}; seeds {facts['seeds']}."
 
 
-def _listed(seeds: Sequence[int]) -> str:
+def _list_seeds(seeds: Sequence[int]) -> str:
     """The seeds, many in a row by the first and the last."""
     if len(seeds) > _MANY and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
         return f"{seeds[0]} to {seeds[-1]}"
     return ", ".join(map(str, seeds))
 
 
-def commit() -> str:
+def describe_commit() -> str:
     """Short hash of the checked out commit, and whether files differ from it, documents aside."""
     try:
-        head = _git("rev-parse", "--short=10", "HEAD")
-        return head + (" with changes" if _git("status", "--porcelain", "--untracked-files=no", "--", ":!docs") else "")
+        head = _run_git("rev-parse", "--short=10", "HEAD")
+        return head + (
+            " with changes" if _run_git("status", "--porcelain", "--untracked-files=no", "--", ":!docs") else ""
+        )
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
 
 
-def _git(*words: str) -> str:
+def _run_git(*words: str) -> str:
     command = ["git", "-C", str(ROOT), *words]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
-def _processor() -> str:
+def _processor_name() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -197,12 +199,12 @@ def _processor() -> str:
     return next(names, platform.processor() or platform.machine())
 
 
-def _memory() -> int:
+def _memory_bytes() -> int:
     """Bytes."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def marks(kind: str) -> tuple[str, str]:
+def document_marks(kind: str) -> tuple[str, str]:
     """The lines between which the tables of a measurement stand."""
     return f"<!-- python -m benchmark {kind} --write-docs -->", f"<!-- end of {kind} -->"
 
@@ -212,7 +214,7 @@ def write_between_marks(path: Path, kind: str, text: str) -> None:
 
     :raises HmtSlamError: where the marks are missing.
     """
-    begin, end = marks(kind)
+    begin, end = document_marks(kind)
     before, found, rest = path.read_text(encoding="utf-8").partition(begin)
     _, closed, after = rest.partition(end)
     if not found or not closed:
@@ -220,7 +222,7 @@ def write_between_marks(path: Path, kind: str, text: str) -> None:
     path.write_text(f"{before}{begin}\n{text}\n{end}{after}", encoding="utf-8")
 
 
-def shown(report: Report, out: Path) -> str:
+def copy_illustrations(report: Report, out: Path) -> str:
     """Copy the pictures of a report that belong into the documents; return the Markdown that shows them.
 
     :param out: folder of the report.

@@ -18,7 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from benchmark.logs import BUNDLED, ROOT, opened
+from benchmark.logs import BUNDLED, ROOT, open_logs
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.process_table import node_command, process_names
@@ -27,7 +27,7 @@ from hmt_slam_ros.ros.domain import own_domain
 from hmt_slam_ros.ros.topics import DOCUMENTS
 
 Parameters = Mapping[str, str | float | list[float]]
-_PATIENCE = 120.0  # s
+_TIMEOUT = 120.0  # s
 _SPIN = 0.005  # s
 NODES = (*process_names(), "robot")
 
@@ -58,16 +58,16 @@ class Listener:
     def __exit__(self, *_fault: object) -> None:
         self._stack.close()
 
-    def until(self, condition: Callable[[], bool], patience: float = _PATIENCE) -> None:
+    def wait_until(self, condition: Callable[[], bool], timeout: float = _TIMEOUT) -> None:
         """Spin until a condition holds.
 
-        :param patience: s.
+        :param timeout: s.
         :raises HmtSlamError: where it does not for so long.
         """
-        deadline = time.monotonic() + patience
+        deadline = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > deadline:
-                raise HmtSlamError(f"a node did not answer within {patience:g} s: see whether scripts/demo.sh runs")
+                raise HmtSlamError(f"a node did not answer within {timeout:g} s: see whether scripts/demo.sh runs")
             self._executor.spin_once(timeout_sec=_SPIN)
 
     @contextmanager
@@ -86,7 +86,7 @@ class Listener:
             yield process
         finally:
             process.send_signal(signal.SIGINT)
-            process.wait(_PATIENCE)
+            process.wait(_TIMEOUT)
 
 
 class Start(NamedTuple):
@@ -96,33 +96,33 @@ class Start(NamedTuple):
     cpu: float
 
 
-def until_answer(name: str) -> Start:
+def time_until_answer(name: str) -> Start:
     """From the start of a node's process until it answers a service call, as it does once it spins."""
-    with Listener() as listener, opened([BUNDLED]) as (log,):
+    with Listener() as listener, open_logs([BUNDLED]) as (log,):
         client = listener.node.create_client(ListParameters, f"{name}/list_parameters")
         begin = time.monotonic()
-        with listener.running(name, _waiting(log.path) if name == "robot" else {}) as process:
-            listener.until(client.service_is_ready)
+        with listener.running(name, _waiting_robot(log.path) if name == "robot" else {}) as process:
+            listener.wait_until(client.service_is_ready)
             answer = client.call_async(ListParameters.Request())
-            listener.until(answer.done)
+            listener.wait_until(answer.done)
             return Start(time.monotonic() - begin, _cpu_seconds(process))
 
 
-def until_first_pose() -> Start:
+def time_until_first_pose() -> Start:
     """From the start of metric SLAM until it has placed the first scan, with scans waiting for it."""
-    with Listener() as listener, opened([BUNDLED]) as (log,):
-        heard: list[String] = []
-        listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], heard.append, topics.CHAIN)
+    with Listener() as listener, open_logs([BUNDLED]) as (log,):
+        estimates: list[String] = []
+        listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], estimates.append, topics.CHAIN)
         robot = listener.node.create_client(ListParameters, "robot/list_parameters")
-        with listener.running("robot", _waiting(log.path)):
-            listener.until(robot.service_is_ready)
+        with listener.running("robot", _waiting_robot(log.path)):
+            listener.wait_until(robot.service_is_ready)
             begin = time.monotonic()
             with listener.running("slam", {"laser_pose": log.scans[0].laser_pose.tolist()}) as process:
-                listener.until(lambda: bool(heard))
+                listener.wait_until(lambda: bool(estimates))
                 return Start(time.monotonic() - begin, _cpu_seconds(process))
 
 
-def _waiting(log: Path) -> Parameters:
+def _waiting_robot(log: Path) -> Parameters:
     """Parameters of a robot that waits for whoever listens."""
     return {"log": str(log), "robot.discovery_timeout": 3600.0, "robot.rate": 0.0}
 

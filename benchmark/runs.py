@@ -47,17 +47,19 @@ class Case:
     def name(self) -> str:
         """Of the output folder."""
         changes = "_".join(re.sub(r"[^\w.]+", "_", change) for change in self.changes)
-        part = "_".join(f"{name}_{of:g}" for name, of in (("from", self.start), ("for", self.duration)) if of)
-        return "-".join(filter(None, (self.log.name, self.kind, changes, part, str(self.seed))))
+        section = "_".join(
+            f"{name}_{seconds:g}" for name, seconds in (("from", self.start), ("for", self.duration)) if seconds
+        )
+        return "-".join(filter(None, (self.log.name, self.kind, changes, section, str(self.seed))))
 
     def command(self, folder: Path) -> list[str]:
         """The command line that maps the log into a folder."""
         program = ["benchmark.degraded_odometry", self.kind] if self.kind else ["hmt_slam_ros.cli.main", "map"]
         options = ["--out", str(folder), "--seed", str(self.seed), "--config", str(PARAMETERS)]
-        given = {"--duration": self.duration, "--start": self.start, "--from": self.source}
-        part = [word for name, value in given.items() if value for word in (name, str(value))]
+        section = {"--duration": self.duration, "--start": self.start, "--from": self.source}
+        section_words = [word for name, value in section.items() if value for word in (name, str(value))]
         changes = [word for change in self.changes for word in ("--set", change)]
-        return [sys.executable, "-m", *program, str(self.log.path), *options, *part, *changes]
+        return [sys.executable, "-m", *program, str(self.log.path), *options, *section_words, *changes]
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ class Runner:
 
         :raises HmtSlamError: where one did.
         """
-        return list(_successful(self.attempts(cases)))
+        return list(check_runs(self.attempts(cases)))
 
     def _run(self, case: Case) -> Run:
         run = run_case(case, self.folder.absolute() / case.name)
@@ -118,7 +120,7 @@ class Runner:
         return run
 
 
-def _successful(runs: Iterable[Run]) -> Iterable[Run]:
+def check_runs(runs: Iterable[Run]) -> Iterable[Run]:
     for run in runs:
         if run.fault:
             raise HmtSlamError(f"the run {run.case.name} failed, it said: {run.fault}")
@@ -135,9 +137,9 @@ def run_case(case: Case, folder: Path) -> Run:
         text=True,
         check=False,
     )
-    last_words = " | ".join(result.stderr.strip().splitlines()[-_TAIL:]) or "nothing"
+    last_lines = " | ".join(result.stderr.strip().splitlines()[-_TAIL:]) or "nothing"
     if result.returncode:
-        return Run(case, folder, 0.0, 0.0, 0, last_words)
+        return Run(case, folder, 0.0, 0.0, 0, last_lines)
     usage = json.loads(result.stdout.splitlines()[-1])
-    fault = last_words if usage["status"] else ""
+    fault = last_lines if usage["status"] else ""
     return Run(case, folder, usage["cpu_s"], usage["wall_s"], int(usage["peak_rss_bytes"]), fault)

@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmark.lattice import BEAMS, OFFSETS, PER_AREA, SPACING, Lattice, LatticeScans, scan_at, shared_scan, stops
+from benchmark.lattice import BEAMS, OFFSETS, PER_AREA, SPACING, Lattice, LatticeScans, make_stops, scan_at, shared_scan
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.scale_maps import BEAMS as STORED_BEAMS
-from benchmark.scale_maps import SCANS_PER_KEYFRAME, Lasting, Stored, lasting, stored
+from benchmark.scale_maps import SCANS_PER_KEYFRAME, AreaMemory, SaveTimes, time_saving, weigh_areas
 from benchmark.scripted import STEP, Script
 from benchmark.settings import Settings
-from benchmark.simulated.examinations import Examination, WatchedBranching
+from benchmark.simulated.examinations import Examination, ObservedBranching
 from hmt_slam_ros.area_abstraction.aam import Aam
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
@@ -93,13 +93,13 @@ def measure_scale(settings: Settings) -> Report:
     stressed = measured_cuts(LARGE[0], load_configuration(PARAMETERS, [*settings.changes, *STRESS]), _FEW)
     scans = cost_of_scans(SMALL, configuration)
     report.requirements += [growth_requirement(process, scans) for process in ("slam", "rtl")]
-    area = stored(LARGE[0])
+    area = weigh_areas(LARGE[0])
     report.requirements.append(Requirement("memory of a stored area with its scans", area.whole, STORED, "kB"))
-    saved = lasting(LASTING, configuration)
+    saved = time_saving(LASTING, configuration)
     name = f"saving and loading a map of {saved.areas} areas"
     report.requirements.append(Requirement(name, saved.whole, SAVED_AND_LOADED, "s"))
     named = {str(areas): own for areas, own in cuts.items()} | {f"{LARGE[0].areas}, stress": stressed}
-    bound = _bound(configuration, [cut for own in named.values() for cut in own])
+    bound = _describe_bound(configuration, [cut for own in named.values() for cut in own])
     report.body += [_cut_table(named), bound, _scan_table(scans), _stored_table(area), _lasting_table(saved), POLICY]
     report.data |= {
         "cuts": {name: [cut._asdict() for cut in own] for name, own in named.items()},
@@ -147,7 +147,7 @@ def _cut_row(name: str, cuts: Sequence[Cut]) -> list[str]:
     ]
 
 
-def _bound(configuration: Configuration, cuts: Sequence[Cut]) -> str:
+def _describe_bound(configuration: Configuration, cuts: Sequence[Cut]) -> str:
     """How long a cut can take."""
     options = configuration.tsbi
     most = options.max_comparisons + MIN_EXAMINED_AREAS * options.max_hypotheses
@@ -171,7 +171,7 @@ def _scan_table(scans: Mapping[int, Mapping[str, float]]) -> str:
     return table(["areas", *(f"{process} [ms a scan]" for process in processes)], rows)
 
 
-def _stored_table(area: Stored) -> str:
+def _stored_table(area: AreaMemory) -> str:
     rows: list[tuple[str, Any]] = [
         ("poses of its keyframes and arcs", area.graph),
         ("scans of its keyframes", area.scans),
@@ -180,7 +180,7 @@ def _stored_table(area: Stored) -> str:
     return table(["of a stored area", "memory [kB]"], [[name, f"{size:.2f}"] for name, size in rows])
 
 
-def _lasting_table(saved: Lasting) -> str:
+def _lasting_table(saved: SaveTimes) -> str:
     head = ["areas", "files [MB]", "save [s]", "load [s]", "load the map alone [s]"]
     return table(head, [[str(saved.areas), *(f"{value:.1f}" for value in saved[1:])]])
 
@@ -211,7 +211,7 @@ class _TimedTsbi:
     def _branching(self, configuration: Configuration, replica: Replica) -> Branching:
         replica.maps[FIRST_HYPOTHESIS] = self._lattice.hybrid_map()
         replica.scans = LatticeScans()
-        return WatchedBranching(configuration, replica, self._count)
+        return ObservedBranching(configuration, replica, self._count)
 
     def _count(self, examination: Examination) -> None:
         self._compared += len(examination.found.examined_areas)
@@ -219,9 +219,9 @@ class _TimedTsbi:
     def handle(self, message: Message) -> list[Message]:
         """As TSBI does."""
         begin = time.process_time()
-        said = self._tsbi.handle(message)
+        messages = self._tsbi.handle(message)
         self._seconds += time.process_time() - begin
-        return said
+        return messages
 
     def take(self) -> tuple[float, int]:
         """Milliseconds and comparisons since the last call."""
@@ -258,17 +258,17 @@ class _Robot:
         way = [(column, 0), (column, -1), *((c, -2) for c in range(column, end + 1)), (end, -1), (end, 0), (end, 1)]
         self._script.go_to(column, shared_scan(0.0, 0))
         random = np.random.default_rng(seed)
-        here, cuts = np.array([SPACING * column, 0.0, 0.0]), []
-        for stop in stops(way):
+        pose, cuts = np.array([SPACING * column, 0.0, 0.0]), []
+        for stop in make_stops(way):
             error = se2.exp(random.multivariate_normal(np.zeros(3), STEP))
-            step, here = se2.compose(se2.between(here, stop.pose), error), stop.pose
+            step, pose = se2.compose(se2.between(pose, stop.pose), error), stop.pose
             self._timed.take()
-            said = self._script.keyframe(step, stop.scan, len(OFFSETS) if stop.last else 0)
-            if len(said.hypotheses) == 1 or stop.pose[1] > SPACING:
-                best = max(said.hypotheses, key=lambda leaf: leaf.probability)
+            answer = self._script.keyframe(step, stop.scan, len(OFFSETS) if stop.last else 0)
+            if len(answer.hypotheses) == 1 or stop.pose[1] > SPACING:
+                best = max(answer.hypotheses, key=lambda hypothesis: hypothesis.probability)
                 self._script.accept(best.id, self._poses)
             if stop.last:
-                cuts.append(Cut(*self._timed.take(), len(said.hypotheses), said.unexamined))
+                cuts.append(Cut(*self._timed.take(), len(answer.hypotheses), answer.unexamined))
         return cuts
 
 
@@ -282,17 +282,17 @@ class _TimedProcess:
     def handle(self, message: Message) -> list[Message]:
         """As the process does."""
         begin = time.process_time()
-        said = self._process.handle(message)
+        messages = self._process.handle(message)
         self.seconds += time.process_time() - begin
-        return said
+        return messages
 
 
 def cost_of_scans(
     lattices: Sequence[Lattice], configuration: Configuration, repeats: int = _REPEATS
 ) -> dict[int, dict[str, float]]:
     """{number of areas: {process: ms a scan}}, medians; the maps take turns, so that all see the same machine."""
-    _costs(lattices[0], configuration)
-    measured = [{lattice.areas: _costs(lattice, configuration) for lattice in lattices} for _ in range(repeats)]
+    _scan_costs(lattices[0], configuration)
+    measured = [{lattice.areas: _scan_costs(lattice, configuration) for lattice in lattices} for _ in range(repeats)]
     return {
         lattice.areas: {
             process: float(np.median([costs[lattice.areas][process] for costs in measured]))
@@ -302,16 +302,16 @@ def cost_of_scans(
     }
 
 
-def _costs(lattice: Lattice, configuration: Configuration) -> dict[str, float]:
+def _scan_costs(lattice: Lattice, configuration: Configuration) -> dict[str, float]:
     """{process: ms a scan} of one drive around the loop."""
     slam, aam, tlca = MetricSlam(configuration), Aam(configuration), Tlca(configuration)
-    tsbi = Tsbi(configuration, lambda c, replica: Branching(c, _filled(replica, lattice)))
+    tsbi = Tsbi(configuration, lambda c, replica: Branching(c, _fill_replica(replica, lattice)))
     for process in (slam, aam, tlca):
-        _filled(process._replica, lattice)
+        _fill_replica(process._replica, lattice)
     processes: dict[str, Process] = {"slam": slam, "aam": aam, "tsbi": tsbi, "tlca": tlca, "rtl": Rtl(configuration)}
     timed = {name: _TimedProcess(process) for name, process in processes.items()}
     lock_step = LockStep(timed)
-    poses = _drive()
+    poses = _loop_poses()
     for k, pose in enumerate(poses):
         stamp = _PERIOD * (k + 1)
         lock_step.feed(Odometry(stamp, pose))
@@ -319,14 +319,14 @@ def _costs(lattice: Lattice, configuration: Configuration) -> dict[str, float]:
     return {name: 1e3 * process.seconds / len(poses) for name, process in timed.items()}
 
 
-def _filled(replica: Replica, lattice: Lattice) -> Replica:
+def _fill_replica(replica: Replica, lattice: Lattice) -> Replica:
     """A replica that knows the map, as if its process had been there."""
     replica.maps[FIRST_HYPOTHESIS] = lattice.hybrid_map()
     replica.scans = LatticeScans()
     return replica
 
 
-def _drive() -> Float64:
+def _loop_poses() -> Float64:
     """Poses around the loop, turning on the spot at its corners, shape (n, 3)."""
     poses: list[Float64] = []
     for side, (start, end) in enumerate(pairwise(SPACING * np.array(_LOOP, dtype=np.float64))):

@@ -58,10 +58,10 @@ def score(folder: Path, log: MeasuredLog, file: str = FINAL) -> RelationErrors:
     :param file: name of the trajectory.
     :raises HmtSlamError: where the log has no true relations, or there is no such trajectory.
     """
-    return scored(read_tum(folder / file), log)
+    return score_trajectory(read_tum(folder / file), log)
 
 
-def scored(trajectory: StampedPoses, log: MeasuredLog) -> RelationErrors:
+def score_trajectory(trajectory: StampedPoses, log: MeasuredLog) -> RelationErrors:
     """Errors of a trajectory of a log.
 
     :raises HmtSlamError: where the log has no true relations.
@@ -71,7 +71,7 @@ def scored(trajectory: StampedPoses, log: MeasuredLog) -> RelationErrors:
     return evaluate_relations(trajectory, log.relations, log.odometry)
 
 
-def errors(folder: Path, log: MeasuredLog, file: str = FINAL) -> PairErrors:
+def score_pairs(folder: Path, log: MeasuredLog, file: str = FINAL) -> PairErrors:
     """Likewise, relation by relation."""
     if log.relations is None:
         raise HmtSlamError(f"the log {log.name} has no true relations: its trajectory cannot be scored")
@@ -90,7 +90,7 @@ class SeedMeans:
     :ivar long_max: largest error of any of these, m.
     :ivar rotation: as ``translation``, degrees.
     :ivar matched: share of the relations.
-    :ivar carried: relations of a seed that needed the odometry, at most.
+    :ivar extrapolated: relations of a seed that needed the odometry, at most.
     :ivar missed: relations of a seed that were missed, at most.
     """
 
@@ -102,7 +102,7 @@ class SeedMeans:
     long_max: float
     rotation: float
     matched: float
-    carried: int
+    extrapolated: int
     missed: int
 
 
@@ -118,7 +118,7 @@ def over_seeds(scores: Sequence[RelationErrors]) -> SeedMeans:
         long_max=float(np.max([score.over_60_s.translation.max for score in scores])),
         rotation=float(np.mean([score.overall.rotation.mean for score in scores])),
         matched=sum(s.overall.matched for s in scores) / sum(s.overall.count for s in scores),
-        carried=max(score.overall.extrapolated for score in scores),
+        extrapolated=max(score.overall.extrapolated for score in scores),
         missed=max(score.overall.missed for score in scores),
     )
 
@@ -183,19 +183,19 @@ def judge_walls(scans: Sequence[Scan], poses: NDArray[np.float64]) -> Walls:
     :param scans: all scans of a log, in its order.
     :param poses: shape (n, 3), ``map_T_base`` of each, m and rad.
     """
-    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
-    used = np.flatnonzero(np.diff(np.floor(travelled / _SPACING), prepend=-1.0))
-    number = np.floor(travelled[used] / _STRETCH)
-    judged = []
+    path_length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    used = np.flatnonzero(np.diff(np.floor(path_length / _SPACING), prepend=-1.0))
+    number = np.floor(path_length[used] / _STRETCH)
+    stretches = []
     for k in np.unique(number):
         begin = float(k * _STRETCH)
-        earlier, later = used[travelled[used] < begin - APART], used[number == k]
+        earlier, later = used[path_length[used] < begin - APART], used[number == k]
         if earlier.size:
-            grid = _Agreement([scans[i] for i in earlier], poses[earlier])
+            grid = _AgreementGrid([scans[i] for i in earlier], poses[earlier])
             points = np.concatenate([se2.transform(poses[i], _returns(scans[i])) for i in later])
-            judged.append(_judged(begin, points, poses[later[later.size // 2], :2], grid))
-    stretches = tuple(stretch for stretch in judged if stretch is not None)
-    return Walls(stretches, len(judged) - len(stretches))
+            stretches.append(_score_stretch(begin, points, poses[later[later.size // 2], :2], grid))
+    compared = tuple(stretch for stretch in stretches if stretch is not None)
+    return Walls(compared, len(stretches) - len(compared))
 
 
 def _returns(scan: Scan) -> NDArray[np.float64]:
@@ -204,7 +204,7 @@ def _returns(scan: Scan) -> NDArray[np.float64]:
     return scan.points[np.hypot(from_laser[:, 0], from_laser[:, 1]) <= _RANGE]
 
 
-class _Agreement:
+class _AgreementGrid:
     """What a return at some place says about the map of some scans."""
 
     def __init__(self, scans: Sequence[Scan], poses: NDArray[np.float64]) -> None:
@@ -215,7 +215,7 @@ class _Agreement:
         self._values: NDArray[np.float64] = np.where(distance < _NEAR, 1.0 - distance / _NEAR, elsewhere)
         self._origin, self._resolution = image.origin, image.resolution
 
-    def of(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Agreement of points (..., 2); 0 where nothing is known."""
         cells = np.floor((points - self._origin) / self._resolution).astype(np.int64)
         size = np.array(self._values.shape[::-1])
@@ -224,28 +224,30 @@ class _Agreement:
         return np.where(inside, self._values[y, x], 0.0)
 
 
-def _judged(begin: float, points: NDArray[np.float64], centre: NDArray[np.float64], grid: _Agreement) -> Stretch | None:
+def _score_stretch(
+    begin: float, points: NDArray[np.float64], center: NDArray[np.float64], grid: _AgreementGrid
+) -> Stretch | None:
     """The stretch, or None where it leads over new ground."""
-    here = grid.of(points)
+    here = grid.at(points)
     known = int(np.count_nonzero(here))
     if known < _SHARE * len(points) or not known:
         return None
     thinned = points[:: max(1, len(points) // _SEARCHED)]
-    kept = max(int(np.count_nonzero(grid.of(thinned))), 1)
-    best, shift = _best_place(thinned, centre, grid)
-    gain = max(0.0, best - grid.of(thinned).sum()) / kept
+    kept = max(int(np.count_nonzero(grid.at(thinned))), 1)
+    best, shift = _best_place(thinned, center, grid)
+    gain = max(0.0, best - grid.at(thinned).sum()) / kept
     return Stretch(begin, known, float(here.sum() / known), float(gain), shift if gain else 0.0)
 
 
-def _best_place(points: NDArray[np.float64], centre: NDArray[np.float64], grid: _Agreement) -> tuple[float, float]:
+def _best_place(points: NDArray[np.float64], center: NDArray[np.float64], grid: _AgreementGrid) -> tuple[float, float]:
     """Largest sum of agreements over all places near by, and how far away it is, m."""
     dx, dy = (axis.ravel() for axis in np.meshgrid(_SHIFTS, _SHIFTS, indexing="ij"))
     shifts = np.stack([dx, dy], axis=1)
-    best, found = -np.inf, 0.0
+    best, distance = -np.inf, 0.0
     for turn in _TURNS:
-        turned = se2.transform(np.array([*centre, turn]), points - centre)
-        sums = grid.of(turned + shifts[:, None]).sum(axis=1)
+        turned = se2.transform(np.array([*center, turn]), points - center)
+        sums = grid.at(turned + shifts[:, None]).sum(axis=1)
         k = int(np.argmax(sums))
         if sums[k] > best:
-            best, found = float(sums[k]), float(np.hypot(*shifts[k]))
-    return best, found
+            best, distance = float(sums[k]), float(np.hypot(*shifts[k]))
+    return best, distance

@@ -47,11 +47,11 @@ class Robot:
     area: int = FIRST_AREA
     pose: PoseGaussian = field(default_factory=lambda: PoseGaussian(np.zeros(3), _START))
 
-    def moved(self, step: Float64, noise: float) -> Robot:
+    def move(self, step: Float64, noise: float) -> Robot:
         """After a motion (3,) by the odometry, of which the deviations are those of ``STEP`` times ``noise``."""
         return Robot(self.area, self.pose.compose(PoseGaussian(step, noise**2 * STEP)))
 
-    def entered(self, area: int, rebase: PoseGaussian | None, keyframes: int, noise: float) -> Robot:
+    def enter(self, area: int, rebase: PoseGaussian | None, keyframes: int, noise: float) -> Robot:
         """After TSBI's answer.
 
         :param keyframes: how many came over into the area.
@@ -85,7 +85,7 @@ class Script:
         :param step: the motion (3,) since the last one as the odometry has it.
         :param cut: how many of the newest keyframes leave the area, under every hypothesis; 0 for none.
         """
-        self.robots = {hypothesis: robot.moved(step, self._noise) for hypothesis, robot in self.robots.items()}
+        self.robots = {hypothesis: robot.move(step, self._noise) for hypothesis, robot in self.robots.items()}
         newest = tuple(range(self.sequence + 2 - cut, self.sequence + 2))
         events = [AreaEvent(h, "cut", newest, robot.area, 0.0) for h, robot in sorted(self.robots.items()) if cut]
         return self._event(scan, events)
@@ -98,25 +98,27 @@ class Script:
 
     def accept(self, hypothesis: int, global_poses: tuple[AreaPose, ...] = ()) -> None:
         """Make a hypothesis definite."""
-        self._tell(ClosureDecision(self.sequence, hypothesis, global_poses=global_poses))
+        self._send(ClosureDecision(self.sequence, hypothesis, global_poses=global_poses))
         self.robots = {hypothesis: self.robots[hypothesis]}
 
     def _event(self, scan: Scan, events: Sequence[AreaEvent], *, stored: bool = True) -> Hypotheses:
         self.sequence += 1
-        leaves = tuple(
+        estimates = tuple(
             HypothesisEstimate(hypothesis, robot.area, robot.pose, stored, 0.0, 0.0, Clutter(), 1.0)
             for hypothesis, robot in sorted(self.robots.items())
         )
-        self._tell(Keyframe(self.sequence, scan, 0.0, leaves))
-        (answer,) = self._tell(AreaEvents(self.sequence, tuple(events)))
+        self._send(Keyframe(self.sequence, scan, 0.0, estimates))
+        (answer,) = self._send(AreaEvents(self.sequence, tuple(events)))
         assert isinstance(answer, Hypotheses)
         before = self.robots
         self.robots = {
-            leaf.id: before[leaf.parent].entered(leaf.area, leaf.frame_change, len(leaf.moved_keyframes), self._noise)
-            for leaf in answer.hypotheses
+            hypothesis.id: before[hypothesis.parent].enter(
+                hypothesis.area, hypothesis.frame_change, len(hypothesis.moved_keyframes), self._noise
+            )
+            for hypothesis in answer.hypotheses
         }
         self.hypotheses = answer
         return answer
 
-    def _tell(self, message: Message) -> list[Message]:
+    def _send(self, message: Message) -> list[Message]:
         return self._tsbi.handle(message)

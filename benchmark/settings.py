@@ -66,7 +66,7 @@ def chosen_families(settings: Settings, families: tuple[str, ...], known: tuple[
     return tuple(chosen)
 
 
-def records_of(
+def make_records(
     settings: Settings, families: tuple[str, ...] = FAMILIES, count: int = SEEDS, others: tuple[str, ...] = ()
 ) -> list[Record]:
     """The records of some families, those of one family one after the other.
@@ -79,9 +79,9 @@ def records_of(
     chosen = chosen_families(settings, families, (*FAMILIES, *others))
     mapped, numbers = (family for family in (*families, *others) if family in chosen), chosen_seeds(settings, count)
     worlds = [World(family, seed) for family in mapped for seed in numbers]
-    return settings.records.of(worlds, settings.changes)
+    return settings.records.make(worlds, settings.changes)
 
 
-def by_family(records: list[Record]) -> dict[str, list[Record]]:
+def group_by_family(records: list[Record]) -> dict[str, list[Record]]:
     """The records of each family."""
     return {family: own for family in FAMILIES if (own := [record for record in records if record["family"] == family])}

@@ -20,8 +20,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmark.logs import BUNDLED, MeasuredLog, missing, opened
-from benchmark.report import Report, Requirement, commit, table
+from benchmark.logs import BUNDLED, MeasuredLog, open_logs, reason_missing
+from benchmark.report import Report, Requirement, describe_commit, table
 from benchmark.runs import Case, Run, Runner
 from benchmark.scoring import FINAL, ONLINE, judge_walls, sample_deviation
 from benchmark.settings import Settings
@@ -73,7 +73,7 @@ Figures = dict[str, list[float]]
 def measure_short(settings: Settings) -> Report:
     """Run the parts whose logs are there, and compare with what is expected, or write what is to be expected."""
     report = Report("short", "Has accuracy become worse?", seeds=tuple(range(max(part.seeds for part in PARTS))))
-    figures = _measure(settings, report)
+    figures = _measure_parts(settings, report)
     if settings.write_expected:
         write_expected(EXPECTED, figures)
     expected = read_expected(EXPECTED)
@@ -85,13 +85,13 @@ def measure_short(settings: Settings) -> Report:
     return report
 
 
-def _measure(settings: Settings, report: Report) -> dict[str, Figures]:
-    reasons = {part.log: missing(part.log) for part in PARTS}
+def _measure_parts(settings: Settings, report: Report) -> dict[str, Figures]:
+    reasons = {part.log: reason_missing(part.log) for part in PARTS}
     if settings.write_expected and any(reasons.values()):
         raise HmtSlamError(f"not all that is expected can be measured: {next(filter(None, reasons.values()))}")
     report.body += [f"Skipped {log}: {reason}." for log, reason in reasons.items() if reason]
     parts = [part for part in PARTS if not reasons[part.log]]
-    with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder, opened([p.log for p in parts]) as logs:
+    with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder, open_logs([p.log for p in parts]) as logs:
         runner = Runner(Path(folder), settings.runner.jobs)
         cases = {
             log: [
@@ -113,11 +113,11 @@ def _cost_table(runs: Mapping[MeasuredLog, Sequence[Run]]) -> str:
 
 def figures_of(log: MeasuredLog, runs: Sequence[Run]) -> Figures:
     """The figures of a log's runs."""
-    own = [_of_relations(log, run) if log.relations is not None else _of_walls(log, run) for run in runs]
+    own = [_relation_figures(log, run) if log.relations is not None else _wall_figures(log, run) for run in runs]
     return {name: [figures[name] for figures in own] for name in own[0]}
 
 
-def _of_relations(log: MeasuredLog, run: Run) -> dict[str, float]:
+def _relation_figures(log: MeasuredLog, run: Run) -> dict[str, float]:
     assert log.relations is not None
     # Without the odometry: what lies beyond the part of the log that was run has to be missed.
     final, online = (evaluate_relations(read_tum(run.folder / file), log.relations) for file in (FINAL, ONLINE))
@@ -130,7 +130,7 @@ def _of_relations(log: MeasuredLog, run: Run) -> dict[str, float]:
     }
 
 
-def _of_walls(log: MeasuredLog, run: Run) -> dict[str, float]:
+def _wall_figures(log: MeasuredLog, run: Run) -> dict[str, float]:
     final, online = (judge_walls(log.scans, read_tum(run.folder / file).poses) for file in (FINAL, ONLINE))
     return {
         "disagreement": 1.0 - final.agreement,
@@ -180,7 +180,7 @@ def write_expected(path: Path, figures: Mapping[str, Figures]) -> None:
     lines = [
         "# Means and sample deviations over some seeds; benchmark/short.py says how they become bounds.",
         "# Written by `python -m benchmark short --write-expected`; do not edit.",
-        f'commit = "{commit()}"',
+        f'commit = "{describe_commit()}"',
         f"seeds = {len(next(iter(next(iter(figures.values())).values())))}",
     ]
     for log, own in figures.items():

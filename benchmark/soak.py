@@ -64,7 +64,7 @@ class Soak:
     """What a run came to.
 
     :ivar seconds: on the wall.
-    :ivar driven: of the log, s.
+    :ivar log_seconds: of the log, s.
     :ivar scans: acknowledged by slam.
     :ivar resident: {node: memory at every look, bytes}.
     :ivar segments: files of shared memory that the nodes had.
@@ -76,7 +76,7 @@ class Soak:
     """
 
     seconds: float = 0.0
-    driven: float = 0.0
+    log_seconds: float = 0.0
     scans: int = 0
     resident: dict[str, list[int]] = field(default_factory=dict)
     segments: set[str] = field(default_factory=set)
@@ -90,19 +90,23 @@ class Soak:
 def measure_soak(settings: Settings) -> Report:
     """Drive as long as is asked for, and look."""
     report = Report("soak", "Long runs of the nodes", seeds=(0,))
-    found = soaked(settings.minutes)
+    found = run_nodes(settings.minutes)
     report.requirements += requirements(found)
     report.data["soak"] = asdict(found) | {name: sorted(getattr(found, name)) for name in ("segments", "leaked")}
-    rows = [[name, *(f"{1e-6 * value:.0f}" for value in _shown(own))] for name, own in found.resident.items()]
-    told = f"{found.seconds / 60:.0f} minutes, {found.driven / 3600:.1f} h of driving, {found.scans} scans"
-    report.body += [told, table(["node", "at 10 % [MB]", "at 50 %", "at 75 %", "at the end", "largest"], rows), POLICY]
+    rows = [[name, *(f"{1e-6 * value:.0f}" for value in _memory_samples(own))] for name, own in found.resident.items()]
+    summary = f"{found.seconds / 60:.0f} minutes, {found.log_seconds / 3600:.1f} h of driving, {found.scans} scans"
+    report.body += [
+        summary,
+        table(["node", "at 10 % [MB]", "at 50 %", "at 75 %", "at the end", "largest"], rows),
+        POLICY,
+    ]
     return report
 
 
 def requirements(found: Soak) -> list[Requirement]:
     """What is asked for of a run."""
     growths = [Requirement(f"{name}: growth of memory", growth(own), GROWTH) for name, own in found.resident.items()]
-    speed = found.driven / found.seconds
+    speed = found.log_seconds / found.seconds
     return [
         *growths,
         Requirement("speed, times real time", speed, math.inf, least=_SHORTFALL * RATE),
@@ -122,11 +126,11 @@ def growth(resident: Sequence[int]) -> float:
     return float(np.mean(resident[-tenth:]) / np.mean(resident[middle : middle + tenth])) - 1.0
 
 
-def _shown(resident: Sequence[int]) -> list[int]:
+def _memory_samples(resident: Sequence[int]) -> list[int]:
     return [*(resident[round(share * (len(resident) - 1))] for share in (0.1, 0.5, 0.75, 1.0)), max(resident)]
 
 
-def soaked(minutes: float) -> Soak:
+def run_nodes(minutes: float) -> Soak:
     """Run the nodes for some minutes.
 
     :raises HmtSlamError: where one of them dies.
@@ -138,7 +142,7 @@ def soaked(minutes: float) -> Soak:
     with (
         tempfile.TemporaryDirectory(prefix="hmt_slam_soak_") as scratch,
         own_domain() as domain,
-        _listening(domain, found) as executor,
+        _listen(domain, found) as executor,
     ):
         with NodeProcesses(Path(scratch), (), print) as children:
             own = [] if TFMessage is not None else ["-p", f"laser_pose:={laser}"]
@@ -148,13 +152,13 @@ def soaked(minutes: float) -> Soak:
                 children.start(node, words, environment)
             robot = {"log": name, "robot.rate": RATE, "robot.odometry_listeners": 2, "robot.discovery_timeout": 600.0}
             children.start("robot", [w for k, v in robot.items() for w in ("-p", f"{k}:={v}")], environment)
-            _watch(executor, children, found, 60.0 * minutes)
+            _observe(executor, children, found, 60.0 * minutes)
         found.statuses = {node: process.returncode for node, process in children.processes.items()}
     found.leaked = {path for path in found.segments if Path(path).exists() and not _is_mapped(path)}
     return found
 
 
-def _watch(executor: SingleThreadedExecutor, children: NodeProcesses, found: Soak, seconds: float) -> None:
+def _observe(executor: SingleThreadedExecutor, children: NodeProcesses, found: Soak, seconds: float) -> None:
     """Look at the nodes until so much time is over since the first scan."""
     begin = next_look = None
     while begin is None or time.monotonic() < begin + seconds:
@@ -165,23 +169,23 @@ def _watch(executor: SingleThreadedExecutor, children: NodeProcesses, found: Soa
             begin = next_look = now if found.scans else None
         elif now >= next_look:
             next_look += _PERIOD
-            _look({name: process.pid for name, process in children.processes.items()}, found)
+            _sample_processes({name: process.pid for name, process in children.processes.items()}, found)
             found.seconds = now - begin
 
 
-def _look(processes: Mapping[str, int], found: Soak) -> None:
+def _sample_processes(processes: Mapping[str, int], found: Soak) -> None:
     for name, pid in processes.items():
-        found.resident[name].append(_resident(pid))
-        found.segments |= _segments(pid)
-    states = Counter(state for state, parent in _states() if parent in (*processes.values(), os.getpid()))
+        found.resident[name].append(_resident_bytes(pid))
+        found.segments |= _mapped_segments(pid)
+    states = Counter(state for state, parent in _process_states() if parent in (*processes.values(), os.getpid()))
     found.zombies = max(found.zombies, states["Z"])
 
 
-def _resident(pid: int) -> int:
+def _resident_bytes(pid: int) -> int:
     return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def _segments(pid: int) -> set[str]:
+def _mapped_segments(pid: int) -> set[str]:
     """Files of shared memory that a process has mapped and that are there."""
     try:
         lines = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8", errors="replace").splitlines()
@@ -193,10 +197,10 @@ def _segments(pid: int) -> set[str]:
 
 def _is_mapped(path: str) -> bool:
     """Whether some process has the segment, one of another program then."""
-    return any(path in _segments(int(entry.name)) for entry in Path("/proc").iterdir() if entry.name.isdecimal())
+    return any(path in _mapped_segments(int(entry.name)) for entry in Path("/proc").iterdir() if entry.name.isdecimal())
 
 
-def _states() -> Iterator[tuple[str, int]]:
+def _process_states() -> Iterator[tuple[str, int]]:
     """State and parent of every OS process."""
     for entry in Path("/proc").iterdir():
         if entry.name.isdecimal():
@@ -208,16 +212,16 @@ def _states() -> Iterator[tuple[str, int]]:
 
 
 @contextmanager
-def _listening(domain: int, found: Soak) -> Iterator[SingleThreadedExecutor]:
+def _listen(domain: int, found: Soak) -> Iterator[SingleThreadedExecutor]:
     """A node that hears how far the robot is, and what goes wrong."""
 
-    def hear_status(message: String) -> None:
+    def add_status(message: String) -> None:
         status = decode(message.data, RobotStatus)
         if status.stamp:
             begin = first.setdefault("stamp", status.stamp)
-            found.scans, found.driven = status.acknowledged, 1e-9 * (status.stamp - begin)
+            found.scans, found.log_seconds = status.acknowledged, 1e-9 * (status.stamp - begin)
 
-    def hear_diagnostics(message: DiagnosticArray) -> None:
+    def add_diagnostics(message: DiagnosticArray) -> None:
         for status in message.status:
             if status.level == DiagnosticStatus.ERROR:
                 found.errors[status.name] = status.message
@@ -236,6 +240,6 @@ def _listening(domain: int, found: Soak) -> Iterator[SingleThreadedExecutor]:
         executor = SingleThreadedExecutor(context=context)
         stack.callback(executor.shutdown)
         executor.add_node(node)
-        node.create_subscription(String, ROBOT_STATUS, hear_status, topics.LATCHED)
-        node.create_subscription(DiagnosticArray, DIAGNOSTICS, hear_diagnostics, topics.STREAM)
+        node.create_subscription(String, ROBOT_STATUS, add_status, topics.LATCHED)
+        node.create_subscription(DiagnosticArray, DIAGNOSTICS, add_diagnostics, topics.STREAM)
         yield executor

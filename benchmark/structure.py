@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
-from benchmark.logs import BUNDLED, opened
+from benchmark.logs import BUNDLED, open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
@@ -53,9 +53,9 @@ def measure_structure(settings: Settings) -> Report:
     lines = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in paths}
     classes = Counter(name for path in paths for name in class_names(path))
     homonyms = sorted(name for name, count in classes.items() if count > 1)
-    with opened([BUNDLED]) as (log,):
-        passages = list(followed(log.path, settings.changes))
-    figures = {kind: typical(passages, kind) for kind in MOST_FILES}
+    with open_logs([BUNDLED]) as (log,):
+        passages = list(follow_log(log.path, settings.changes))
+    figures = {kind: typical_passage(passages, kind) for kind in MOST_FILES}
     report.requirements = [
         Requirement("lines of the package", sum(lines.values()), MOST_LINES),
         Requirement("lines of the longest file", max(lines.values()), LONGEST),
@@ -78,7 +78,7 @@ def class_names(path: Path) -> Iterator[str]:
             yield node.name.lstrip("_")
 
 
-def typical(passages: list[Passage], kind: str) -> Passage:
+def typical_passage(passages: list[Passage], kind: str) -> Passage:
     """The median of a kind's passages; of closures, the largest."""
     own = [one for one in passages if one.kind == kind]
     over: Callable[[list[int]], float] = max if kind == "closure" else statistics.median
@@ -86,7 +86,7 @@ def typical(passages: list[Passage], kind: str) -> Passage:
     return Passage(kind, round(over(files)), round(over(moves)))
 
 
-def followed(path: Path, changes: tuple[str, ...]) -> Iterator[Passage]:
+def follow_log(path: Path, changes: tuple[str, ...]) -> Iterator[Passage]:
     """What each scan of a log passes; those before the first keyframe events are left out."""
     run = LockStepRun(load_configuration(PARAMETERS, list(changes)))
     recorder = run.recorder

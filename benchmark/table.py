@@ -20,13 +20,13 @@ from matplotlib.figure import Figure
 
 from benchmark import charted_run
 from benchmark.charted_run import AREAS, METRIC
-from benchmark.logs import BUNDLED, MeasuredLog, datasets, opened
+from benchmark.logs import BUNDLED, MeasuredLog, dataset_folder, open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.robustness import LONG_LIMIT
 from benchmark.runs import PARAMETERS, Case, Run, Runner
 from benchmark.scoring import FINAL
 from benchmark.settings import Settings
-from benchmark.simulated.records import code
+from benchmark.simulated.records import code_hash
 from benchmark.simulated.worlds import CAMPUS, CAMPUS_WORLD
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import (
@@ -109,26 +109,26 @@ class Comparison:
     :ivar ours: the program as it is.
     :ivar metric: one area for everything, with more and more particles.
     :ivar runs: {method: its run with the first seed}.
-    :ivar judge: what the errors are from.
+    :ivar reference_name: what the errors are from.
     """
 
     ours: Entry
     metric: tuple[Entry, ...]
     runs: dict[str, Run]
-    judge: str
+    reference_name: str
 
     @property
-    def equal(self) -> bool:
+    def is_equal(self) -> bool:
         """Whether the last metric filter is as accurate."""
         return self.metric[-1].as_accurate_as(self.ours)
 
     @property
-    def memory(self) -> float:
+    def memory_ratio(self) -> float:
         """How many times as much memory the last metric filter takes."""
         return self.metric[-1].peak / self.ours.peak
 
     @property
-    def time(self) -> float:
+    def time_ratio(self) -> float:
         """Likewise CPU time."""
         return self.metric[-1].cpu / self.ours.cpu
 
@@ -139,10 +139,10 @@ def measure_table(settings: Settings) -> Report:
     if strange := [name for name in names if name not in EXTENTS]:
         raise HmtSlamError(f"there is no {strange[0]!r} to compare on: choose from {', '.join(EXTENTS)}")
     report = Report("table", "Time and memory against a global metric RBPF", seeds=seeds)
-    runner = KeptRunner(settings.records.folder / "table", jobs=1)
-    with compared(names) as logs:
-        _compile()
-        found = {log.name: _compared(log, seeds, settings.changes, runner) for log in logs}
+    runner = CachedRunner(settings.records.folder / "table", jobs=1)
+    with open_compared_logs(names) as logs:
+        _compile_kernels()
+        found = {log.name: _compare_log(log, seeds, settings.changes, runner) for log in logs}
     if CAMPUS in found:
         report.requirements += requirements(found[CAMPUS])
     processes = {name: own.runs["HMT-SLAM"].report["ms_per_scan"] for name, own in found.items()}
@@ -159,18 +159,18 @@ def measure_table(settings: Settings) -> Report:
     return report
 
 
-def _compile() -> None:
+def _compile_kernels() -> None:
     """One run that is not counted, for the kernels that are not in the cache."""
-    with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder, opened([BUNDLED]) as (log,):
-        Runner(Path(folder), jobs=1).runs([Charted(log, 0, way=AREAS)])
+    with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder, open_logs([BUNDLED]) as (log,):
+        Runner(Path(folder), jobs=1).runs([ChartedCase(log, 0, variant=AREAS)])
 
 
-def _compared(log: MeasuredLog, seeds: Sequence[int], changes: tuple[str, ...], runner: Runner) -> Comparison:
-    own = runner.runs([Charted(log, seed, changes=changes, way=AREAS) for seed in seeds])
-    relations, judge = reference_of(log, own[0])
+def _compare_log(log: MeasuredLog, seeds: Sequence[int], changes: tuple[str, ...], runner: Runner) -> Comparison:
+    own = runner.runs([ChartedCase(log, seed, changes=changes, variant=AREAS) for seed in seeds])
+    relations, reference_name = choose_reference(log, own[0])
 
     def entry(method: str, particles: int, runs: Sequence[Run]) -> Entry:
-        errors = [judged(run, relations) for run in runs]
+        errors = [score_run(run, relations) for run in runs]
         return Entry(
             method,
             particles,
@@ -194,18 +194,18 @@ def _compared(log: MeasuredLog, seeds: Sequence[int], changes: tuple[str, ...], 
         kept[f"metric RBPF, {particles} particles"] = runs[0]
         if metric[-1].as_accurate_as(ours):
             break
-    return Comparison(ours, tuple(metric), kept, judge)
+    return Comparison(ours, tuple(metric), kept, reference_name)
 
 
 def requirements(campus: Comparison) -> list[Requirement]:
     """What is asked for on the campus."""
     last = campus.metric[-1]
-    how = "as accurate" if campus.equal else "not as accurate"
-    of = f"metric RBPF of {last.particles} particles, {how}, against HMT-SLAM on the campus"
+    accuracy = "as accurate" if campus.is_equal else "not as accurate"
+    subject = f"metric RBPF of {last.particles} particles, {accuracy}, against HMT-SLAM on the campus"
     return [
         Requirement("largest error of HMT-SLAM on the campus, over 60 s", campus.ours.worst, LONG_LIMIT, "m"),
-        Requirement(f"memory of the {of}", campus.memory, float("inf"), "times", least=MEMORY),
-        Requirement(f"CPU time of the {of}", campus.time, float("inf"), "times", least=TIME),
+        Requirement(f"memory of the {subject}", campus.memory_ratio, float("inf"), "times", least=MEMORY),
+        Requirement(f"CPU time of the {subject}", campus.time_ratio, float("inf"), "times", least=TIME),
     ]
 
 
@@ -221,7 +221,9 @@ def comparison_table(found: dict[str, Comparison]) -> str:
             costs = [f"{cost:.0f}" for cost in (entry.cpu, entry.refinement, entry.peak, entry.start, entry.maps)]
             same = "yes" if entry.as_accurate_as(own.ours) else "no"
             errors = [f"{error:.3f}" for error in (entry.error, entry.long_error, entry.worst)]
-            rows.append([name, entry.method, *counts, *costs, *errors, own.judge, "" if entry is own.ours else same])
+            rows.append(
+                [name, entry.method, *counts, *costs, *errors, own.reference_name, "" if entry is own.ours else same]
+            )
     return table(head, rows)
 
 
@@ -232,8 +234,8 @@ def _ratio_table(found: dict[str, Comparison]) -> str:
     for name, own in found.items():
         last, ours = own.metric[-1], own.ours
         grown = (last.peak - last.start) / (ours.peak - ours.start)
-        ratios = [f"{ratio:.2f}" for ratio in (own.memory, grown, last.maps / ours.maps, own.time)]
-        rows.append([name, str(last.particles), "yes" if own.equal else "no", *ratios])
+        ratios = [f"{ratio:.2f}" for ratio in (own.memory_ratio, grown, last.maps / ours.maps, own.time_ratio)]
+        rows.append([name, str(last.particles), "yes" if own.is_equal else "no", *ratios])
     return table(head, rows)
 
 
@@ -244,67 +246,67 @@ def _process_table(processes: dict[str, dict[str, float]]) -> str:
 
 
 @dataclass(frozen=True)
-class Charted(Case):
+class ChartedCase(Case):
     """A run whose cost is told as it goes on.
 
-    :ivar way: "areas" or "metric", see :mod:`benchmark.charted_run`.
+    :ivar variant: "areas" or "metric", see :mod:`benchmark.charted_run`.
     """
 
-    way: str = ""
+    variant: str = ""
 
     @property
     def name(self) -> str:
         """Of the output folder."""
-        return f"{self.way}-{super().name}"
+        return f"{self.variant}-{super().name}"
 
     def command(self, folder: Path) -> list[str]:
         """The command line that maps the log into a folder."""
         options = ["--out", str(folder), "--seed", str(self.seed), "--config", str(PARAMETERS)]
         changes = [word for change in self.changes for word in ("--set", change)]
-        return [sys.executable, "-m", "benchmark.charted_run", self.way, str(self.log.path), *options, *changes]
+        return [sys.executable, "-m", "benchmark.charted_run", self.variant, str(self.log.path), *options, *changes]
 
 
-def metric_case(log: MeasuredLog, seed: int, changes: tuple[str, ...], particles: int) -> Charted:
+def metric_case(log: MeasuredLog, seed: int, changes: tuple[str, ...], particles: int) -> ChartedCase:
     """One area for everything, with so many particles."""
     own = (f"local_map.extent={EXTENTS[log.name]:g}", f"filter.particles={particles}")
-    return Charted(log, seed, changes=(*changes, *own), way=METRIC)
+    return ChartedCase(log, seed, changes=(*changes, *own), variant=METRIC)
 
 
-class KeptRunner(Runner):
+class CachedRunner(Runner):
     """Runs that stay in their folder, and are made anew only for another program or other parameters."""
 
     def _run(self, case: Case) -> Run:
         folder = self.folder.absolute() / case.name
-        kept = folder / "usage.json"
-        if kept.is_file():
-            usage: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
-            if usage.pop("code") == _code():
+        usage_file = folder / "usage.json"
+        if usage_file.is_file():
+            usage: dict[str, Any] = json.loads(usage_file.read_text(encoding="utf-8"))
+            if usage.pop("code") == _fingerprint():
                 return Run(case, folder, **usage)
         shutil.rmtree(folder, ignore_errors=True)
         run = super()._run(case)
         if not run.fault:
             usage = {"cpu_seconds": run.cpu_seconds, "wall_seconds": run.wall_seconds, "peak_rss": run.peak_rss}
-            kept.write_text(json.dumps(usage | {"code": _code()}), encoding="utf-8")
+            usage_file.write_text(json.dumps(usage | {"code": _fingerprint()}), encoding="utf-8")
         return run
 
 
-def _code() -> str:
+def _fingerprint() -> str:
     """What the runs of this code are known by."""
-    return code() + hashlib.sha256(Path(charted_run.__file__).read_bytes()).hexdigest()[:8]
+    return code_hash() + hashlib.sha256(Path(charted_run.__file__).read_bytes()).hexdigest()[:8]
 
 
 @contextmanager
-def compared(names: Sequence[str]) -> Iterator[list[MeasuredLog]]:
+def open_compared_logs(names: Sequence[str]) -> Iterator[list[MeasuredLog]]:
     """The logs of some names, the campus among them.
 
     :raises HmtSlamError: for a name that is none, or a file that is not there.
     """
-    with opened([name for name in names if name != CAMPUS]) as logs:
+    with open_logs([name for name in names if name != CAMPUS]) as logs:
         by_name = {log.name: log for log in logs} | {CAMPUS: MeasuredLog(CAMPUS, Path(CAMPUS_WORLD))}
         yield [by_name[name] for name in names]
 
 
-def reference_of(log: MeasuredLog, run: Run) -> tuple[Relations, str]:
+def choose_reference(log: MeasuredLog, run: Run) -> tuple[Relations, str]:
     """Relations by which the trajectories of a log are judged, and where they are from.
 
     :param run: of the program as it is, by which the others are judged where nothing else is known.
@@ -313,16 +315,16 @@ def reference_of(log: MeasuredLog, run: Run) -> tuple[Relations, str]:
         return true_relations(read_true_poses(open_simulated(CAMPUS_WORLD))), "truth"
     if log.relations is not None:
         return log.relations, "relations"
-    file = datasets() / _GMAPPING
+    file = dataset_folder() / _GMAPPING
     if log.name in file.name and file.is_file():
-        with lzma.open(file, "rt", encoding="utf-8") as lines:
-            rows = np.loadtxt(lines)
+        with lzma.open(file, "rt", encoding="utf-8") as source:
+            rows = np.loadtxt(source)
         stamps = np.round(1e9 * rows[:, 0]).astype(np.int64)
         return true_relations(StampedPoses(stamps, rows[:, 1:4])), "GMapping"
     return true_relations(read_tum(run.folder / FINAL)), "the other run"
 
 
-def judged(run: Run, relations: Relations) -> RelationErrors:
+def score_run(run: Run, relations: Relations) -> RelationErrors:
     """Errors of a run's trajectory."""
     log = run.case.log
     odometry = None if log.name == CAMPUS else log.odometry

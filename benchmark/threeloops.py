@@ -56,7 +56,7 @@ POLICY = (
 )
 
 
-Heard = Callable[[HybridMap, AreaLoop | None, float], None]
+ProposalListener = Callable[[HybridMap, AreaLoop | None, float], None]
 
 
 class Proposal(NamedTuple):
@@ -72,67 +72,70 @@ class Proposal(NamedTuple):
     seconds: float = 0.0
 
     @property
-    def right(self) -> bool:
+    def is_right(self) -> bool:
         """Whether that is how the two areas lie."""
         return self.error is not None and self.error[0] <= NEAR and self.error[1] <= TURN
 
 
-class Closed(NamedTuple):
+class AcceptedClosure(NamedTuple):
     """A closure that was accepted.
 
     :ivar at: path length, m.
-    :ivar right: whether the two areas meet there.
+    :ivar is_right: whether the two areas meet there.
     """
 
     at: float
-    right: bool
+    is_right: bool
 
 
 class Drive(NamedTuple):
     """What came of a drive.
 
-    :ivar travelled: m.
+    :ivar traveled: m.
     :ivar begins: path lengths at which the robot came back to known ground, m.
     :ivar proposals: at every cut at which landmarks were asked.
     :ivar accepted: the closures.
     """
 
-    travelled: float
+    traveled: float
     begins: list[float]
     proposals: list[Proposal]
-    accepted: list[Closed]
+    accepted: list[AcceptedClosure]
 
     @property
-    def made(self) -> list[Proposal]:
+    def made_proposals(self) -> list[Proposal]:
         """The cuts at which something was proposed."""
-        return [one for one in self.proposals if one.error is not None]
+        return [proposal for proposal in self.proposals if proposal.error is not None]
 
     @property
-    def ways(self) -> list[float]:
+    def closing_distances(self) -> list[float]:
         """From each loop that was closed the path from its begin to the first right closure, m."""
-        ways = (
-            min((one.at - begin for one in self.accepted if one.right and one.at >= begin), default=None)
+        closing_distances = (
+            min(
+                (proposal.at - begin for proposal in self.accepted if proposal.is_right and proposal.at >= begin),
+                default=None,
+            )
             for begin in self.begins
         )
-        return [way for way in ways if way is not None]
+        return [way for way in closing_distances if way is not None]
 
 
-class _Listening(LoopProposer):
+class _ReportingProposer(LoopProposer):
     """Proposes loops, and tells which."""
 
-    def __init__(self, configuration: Configuration, views: AreaViewCache, heard: Heard) -> None:
+    def __init__(self, configuration: Configuration, views: AreaViewCache, listener: ProposalListener) -> None:
         super().__init__(configuration, views)
-        self._heard = heard
+        self._listener = listener
 
     def propose(self, hybrid_map: HybridMap) -> AreaLoop | None:
         """As always."""
         begin = time.process_time()
         found = super().propose(hybrid_map)
-        self._heard(hybrid_map, found, time.process_time() - begin)
+        self._listener(hybrid_map, found, time.process_time() - begin)
         return found
 
 
-class _Watch(Watch):
+class _ProposalWatch(Watch):
     """Judges proposals, too."""
 
     def __post_init__(self) -> None:
@@ -144,104 +147,108 @@ class _Watch(Watch):
         branching = super().branching(configuration, replica)
         evidence = branching.landmarks
         if isinstance(evidence, PlaceEvidence) and evidence.loops is not None:
-            evidence.loops = _Listening(configuration, evidence.views, self._proposed)
+            evidence.loops = _ReportingProposer(configuration, evidence.views, self._add_proposal)
         return branching
 
-    def _proposed(self, hybrid_map: HybridMap, loop: AreaLoop | None, seconds: float) -> None:
+    def _add_proposal(self, hybrid_map: HybridMap, loop: AreaLoop | None, seconds: float) -> None:
         error = None
         if loop is not None:
             frames = (self.truth.frame(hybrid_map, area) for area in (loop.area, loop.other_area))
-            off = se2.between(loop.pose.mean, se2.between(*frames))
-            error = float(np.hypot(off[0], off[1])), float(np.degrees(abs(off[2])))
-        self.proposals.append(Proposal(max(self.travelled.values()), error, seconds))
+            difference = se2.between(loop.pose.mean, se2.between(*frames))
+            error = float(np.hypot(difference[0], difference[1])), float(np.degrees(abs(difference[2])))
+        self.proposals.append(Proposal(max(self.traveled.values()), error, seconds))
 
 
 def measure_threeloops(settings: Settings) -> Report:
     """Go round with landmarks that propose loops, and without."""
     seeds = chosen_seeds(settings, SEEDS)
     worlds = [(world, seed) for world in ELSEWHERE for seed in chosen_seeds(settings, ELSEWHERE_SEEDS)]
-    asked, silent = (partial(drive, changes=(*settings.changes, f"places.loops={on}")) for on in ("true", "false"))
+    with_proposals, without_proposals = (
+        partial(drive_laps, changes=(*settings.changes, f"places.loops={on}")) for on in ("true", "false")
+    )
     with ProcessPoolExecutor(settings.records.jobs) as pool:
-        elsewhere = pool.map(asked, *zip(*((seed, f"{world},seed={seed}") for world, seed in worlds), strict=True))
-        with_them, without = (list(pool.map(own, seeds)) for own in (asked, silent))
+        elsewhere = pool.map(
+            with_proposals, *zip(*((seed, f"{world},seed={seed}") for world, seed in worlds), strict=True)
+        )
+        with_them, without = (list(pool.map(run, seeds)) for run in (with_proposals, without_proposals))
         others = list(elsewhere)
     report = Report("threeloops", "Loops that only the belief over places proposes", seeds=seeds)
     report.requirements = [*requirements(with_them, without), *elsewhere_requirements(others)]
-    rows = [_row(f"{seed}", *pair) for seed, *pair in zip(seeds, with_them, without, strict=True)]
-    head = ["building", "travelled [m]", "loops", "cuts before", "proposals", "cuts behind", "proposals in all"]
+    rows = [_drive_row(f"{seed}", *pair) for seed, *pair in zip(seeds, with_them, without, strict=True)]
+    head = ["building", "traveled [m]", "loops", "cuts before", "proposals", "cuts behind", "proposals in all"]
     head += ["false", "closures accepted", "false", "loops closed", "after [m]", "closed without proposals"]
     report.body.append(table(head, rows))
-    rows = [_elsewhere_row(f"{world} {seed}", own) for (world, seed), own in zip(worlds, others, strict=True)]
-    head = ["elsewhere", "travelled [m]", "cuts", "s a cut, most", "proposals", "false", "closures accepted", "false"]
+    rows = [_elsewhere_row(f"{world} {seed}", run) for (world, seed), run in zip(worlds, others, strict=True)]
+    head = ["elsewhere", "traveled [m]", "cuts", "s a cut, most", "proposals", "false", "closures accepted", "false"]
     report.body += [table(head, rows), POLICY]
     return report
 
 
 def requirements(with_them: Sequence[Drive], without: Sequence[Drive]) -> list[Requirement]:
     """What is asked of drives with proposals, and of those without."""
-    proposed = sum(not one.right for own in with_them for one in own.made)
-    accepted = sum(not one.right for own in with_them for one in own.accepted)
+    false_proposals = sum(not one.is_right for own in with_them for one in own.made_proposals)
+    false_closures = sum(not one.is_right for own in with_them for one in own.accepted)
     return [
-        Requirement("loops closed, share", _closed(with_them), 1.0, least=1.0),
-        Requirement("proposals that are false", proposed, 0),
-        Requirement("closures accepted falsely", accepted, 0),
-        Requirement("loops closed without proposals, share", _closed(without), 0),
+        Requirement("loops closed, share", _closed_share(with_them), 1.0, least=1.0),
+        Requirement("proposals that are false", false_proposals, 0),
+        Requirement("closures accepted falsely", false_closures, 0),
+        Requirement("loops closed without proposals, share", _closed_share(without), 0),
     ]
 
 
 def elsewhere_requirements(drives: Sequence[Drive]) -> list[Requirement]:
     """What is asked of drives through other worlds."""
-    proposed = sum(not one.right for own in drives for one in own.made)
-    accepted = sum(not one.right for own in drives for one in own.accepted)
+    false_proposals = sum(not one.is_right for own in drives for one in own.made_proposals)
+    false_closures = sum(not one.is_right for own in drives for one in own.accepted)
     return [
-        Requirement("elsewhere: proposals that are false", proposed, 0),
-        Requirement("elsewhere: closures accepted falsely", accepted, 0),
+        Requirement("elsewhere: proposals that are false", false_proposals, 0),
+        Requirement("elsewhere: closures accepted falsely", false_closures, 0),
     ]
 
 
-def drive(seed: int, building: str = "", *, changes: tuple[str, ...]) -> Drive:
+def drive_laps(seed: int, building: str = "", *, changes: tuple[str, ...]) -> Drive:
     """Go round in one building, an institute if no other is named."""
     configuration = load_configuration(PARAMETERS, [f"tsbi.prior_limit={LIMIT:g}", *changes], seed)
     log = open_simulated(f"sim:{building or f'institute,seed={seed},laps={_LAPS},people={PEOPLE},{LASER}'}")
-    watch = _Watch(log, configuration)
+    watch = _ProposalWatch(log, configuration)
     watch.run()
     begins = [loop.begin for loop in watch.loops.found if loop.can_be_closed]
-    accepted = [Closed(watch.travelled[closure["event"]], closure["right"]) for closure in watch.accepted]
-    return Drive(max(watch.travelled.values()), begins, watch.proposals, accepted)
+    accepted = [AcceptedClosure(watch.traveled[closure["event"]], closure["right"]) for closure in watch.accepted]
+    return Drive(max(watch.traveled.values()), begins, watch.proposals, accepted)
 
 
-def _closed(drives: Sequence[Drive]) -> float:
+def _closed_share(drives: Sequence[Drive]) -> float:
     """Share of the loops."""
-    return sum(len(own.ways) for own in drives) / max(1, sum(len(own.begins) for own in drives))
+    return sum(len(own.closing_distances) for own in drives) / max(1, sum(len(own.begins) for own in drives))
 
 
 def _elsewhere_row(building: str, own: Drive) -> list[str]:
     return [
         building,
-        f"{own.travelled:.0f}",
+        f"{own.traveled:.0f}",
         str(len(own.proposals)),
         f"{max((one.seconds for one in own.proposals), default=0.0):.2f}",
-        str(len(own.made)),
-        str(sum(not one.right for one in own.made)),
+        str(len(own.made_proposals)),
+        str(sum(not one.is_right for one in own.made_proposals)),
         str(len(own.accepted)),
-        str(sum(not one.right for one in own.accepted)),
+        str(sum(not one.is_right for one in own.accepted)),
     ]
 
 
-def _row(building: str, own: Drive, without: Drive) -> list[str]:
-    before = [one for one in own.proposals if one.at < min(own.begins, default=own.travelled)]
+def _drive_row(building: str, own: Drive, without: Drive) -> list[str]:
+    before = [one for one in own.proposals if one.at < min(own.begins, default=own.traveled)]
     return [
         building,
-        f"{own.travelled:.0f}",
+        f"{own.traveled:.0f}",
         str(len(own.begins)),
         str(len(before)),
         str(sum(one.error is not None for one in before)),
         str(len(own.proposals) - len(before)),
-        str(len(own.made)),
-        str(sum(not one.right for one in own.made)),
+        str(len(own.made_proposals)),
+        str(sum(not one.is_right for one in own.made_proposals)),
         str(len(own.accepted)),
-        str(sum(not one.right for one in own.accepted)),
-        str(len(own.ways)),
-        ", ".join(f"{way:.0f}" for way in own.ways) or "-",
-        str(len(without.ways)),
+        str(sum(not one.is_right for one in own.accepted)),
+        str(len(own.closing_distances)),
+        ", ".join(f"{way:.0f}" for way in own.closing_distances) or "-",
+        str(len(without.closing_distances)),
     ]

@@ -32,7 +32,7 @@ class Play:
         self.k = -1
         self.notices = []
 
-    def step(self, *leaves, places=None, world=HOME, travelled=None):
+    def step(self, *leaves, places=None, world=HOME, traveled=None):
         """One keyframe event: ``places`` are (hypothesis, area, area_T_base) before it, ``leaves`` TSBI's answer.
 
         Without places the keyframe is at the origin of the robot's area, and is the first of an area that is new.
@@ -45,8 +45,8 @@ class Play:
         estimates = tuple(
             HypothesisEstimate(h, area, belief(pose), True, 0.0, 0.0, Clutter(), 12.0) for h, area, pose in places
         )
-        travelled = 0.5 * self.k if travelled is None else travelled
-        assert self.process.handle(Keyframe(self.k, worlds.scan_at(WORLD, world), travelled, estimates)) == []
+        traveled = 0.5 * self.k if traveled is None else traveled
+        assert self.process.handle(Keyframe(self.k, worlds.scan_at(WORLD, world), traveled, estimates)) == []
         said = self.process.handle(Hypotheses(self.k, tuple(leaves) or (Hypothesis(0, 0, 1.0, 0),)))
         verdicts = [message for message in said if isinstance(message, ClosureDecision)]
         self.notices += [message for message in said if isinstance(message, Notice)]

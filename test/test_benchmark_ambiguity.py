@@ -5,8 +5,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmark.ambiguity import NEW, RIGHT, WRONG, Reentry, Verdict, requirements, settling_table, story, verdict
-from benchmark.simulated.loops import Loop, by_odometry, looks_alike, rivalries
+from benchmark.ambiguity import (
+    NEW,
+    RIGHT,
+    WRONG,
+    Reentry,
+    Verdict,
+    judge_reentry,
+    requirements,
+    settling_table,
+    trace_hypotheses,
+)
+from benchmark.simulated.loops import Loop, looks_alike, odometry_probabilities, rivalries
 from benchmark.simulated.truth import Truth
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation import open_simulated
@@ -18,7 +28,7 @@ def leaf(hypothesis, parent, probability, right=0, wrong=0):
 
 
 def entry(event, *leaves):
-    return {"event": event, "stamp": 10**9 * event, "travelled": 0.5 * event, "unexamined": 0.0, "leaves": list(leaves)}
+    return {"event": event, "stamp": 10**9 * event, "traveled": 0.5 * event, "unexamined": 0.0, "leaves": list(leaves)}
 
 
 PMF = [
@@ -32,7 +42,7 @@ PMF = [
 
 
 def test_hypotheses_are_told_by_the_loops_that_they_and_their_parents_closed():
-    moments = story(PMF, 0)
+    moments = trace_hypotheses(PMF, 0)
     assert [moment.probabilities[RIGHT] for moment in moments] == [0.0, 0.5, 0.7, 0.97, 1.0]
     assert [moment.probabilities[WRONG] for moment in moments] == [0.0, 0.4, 0.3, 0.03, 0.0]
     assert [moment.probabilities[NEW] for moment in moments] == [1.0, 0.1, 0.0, 0.0, 0.0]
@@ -44,15 +54,15 @@ def test_the_question_is_open_once_known_places_have_a_fifth():
     shares = [[], [0.19], [0.1, 0.1]]
     known = [[leaf(1 + n, 0, share, 1) for n, share in enumerate(own)] for own in shares]
     pmf = [entry(k, leaf(0, 0, 1.0 - sum(own)), *known[k]) for k, own in enumerate(shares)]
-    assert [moment.asked for moment in story(pmf, 0)] == [False, False, True]
+    assert [moment.asked for moment in trace_hypotheses(pmf, 0)] == [False, False, True]
 
 
 def test_what_closed_before_the_story_begins_does_not_count():
-    assert not any(moment.asked for moment in story(PMF, 2)[:1])
+    assert not any(moment.asked for moment in trace_hypotheses(PMF, 2)[:1])
 
 
 def test_both_are_alive_until_the_evidence_and_the_true_one_is_sure_soon_after():
-    judged = verdict(story(PMF, 0), evidence=3)
+    judged = judge_reentry(trace_hypotheses(PMF, 0), evidence=3)
     assert (judged.lowest, judged.highest, judged.when_asked, judged.at_evidence) == (0.3, 0.7, 0.5, 0.7)
     assert judged.both_alive
     assert judged.waited == 0.0
@@ -60,14 +70,14 @@ def test_both_are_alive_until_the_evidence_and_the_true_one_is_sure_soon_after()
 
 
 def test_a_hypothesis_that_is_ruled_out_before_the_evidence_is_not_alive():
-    judged = verdict(story(PMF, 0), evidence=4)
+    judged = judge_reentry(trace_hypotheses(PMF, 0), evidence=4)
     assert not judged.both_alive
     assert judged.lowest == 0.03
 
 
 def test_the_wrong_place_is_never_sure():
     swapped = [entry(e["event"], *(leaf(**swap(one)) for one in e["leaves"])) for e in PMF]
-    judged = verdict(story(swapped, 0), evidence=3)
+    judged = judge_reentry(trace_hypotheses(swapped, 0), evidence=3)
     assert judged.both_alive
     assert judged.waited is None
     assert not judged.settled
@@ -84,14 +94,14 @@ def swap(one):
 
 
 def test_a_question_after_the_evidence_shows_nothing_alive_but_can_settle():
-    judged = verdict(story(PMF, 0), evidence=0)
+    judged = judge_reentry(trace_hypotheses(PMF, 0), evidence=0)
     assert judged.asked
     assert not judged.both_alive
     assert judged.waited == pytest.approx(1.0)
 
 
 def test_nothing_asked_is_nothing_settled():
-    judged = verdict(story([entry(k, leaf(0, 0, 1.0)) for k in range(3)], 0), evidence=1)
+    judged = judge_reentry(trace_hypotheses([entry(k, leaf(0, 0, 1.0)) for k in range(3)], 0), evidence=1)
     assert not judged.asked
     assert not judged.settled
 
@@ -144,7 +154,7 @@ def test_odometry_rules_out_what_is_many_deviations_off_and_not_what_is_none_off
     truth = noted(twins, 60)
     here = truth.poses[30]
     near, far = se2.compose(here, np.array([0.05, 0.0, 0.0])), se2.compose(here, np.array([0.0, 0.0, np.pi]))
-    weights = by_odometry(twins, truth, 20, 30, [here, near, far])
+    weights = odometry_probabilities(twins, truth, 20, 30, [here, near, far])
     assert weights.sum() == pytest.approx(1.0)
     assert weights[1] == pytest.approx(weights[0], rel=0.5)
     assert weights[2] < 1e-3
@@ -153,9 +163,9 @@ def test_odometry_rules_out_what_is_many_deviations_off_and_not_what_is_none_off
 def test_in_the_ring_odometry_decides_and_views_never_do():
     log = open_simulated("sim:ring,seed=0")
     truth = noted(log, 201)
-    travelled = {k: 0.55 * k for k in truth.poses}
+    traveled = {k: 0.55 * k for k in truth.poses}
     loop = Loop(100, 55.0, 60.0, 55.0, {100: (0,), 101: (1,)})
-    (found,) = rivalries(log, truth, [loop], travelled)
+    (found,) = rivalries(log, truth, [loop], traveled)
     assert (found.event, found.since, found.evidence) == (100, 0, None)
     assert found.by_odometry > 0.99
 
@@ -168,9 +178,9 @@ def test_a_world_without_identical_places_has_no_rivalry():
 def test_it_is_told_how_much_path_the_true_place_needs_to_become_sure():
     slow = [entry(0, leaf(0, 0, 1.0)), entry(1, leaf(2, 0, 0.5, right=1), leaf(3, 0, 0.5, wrong=1))]
     slow += [entry(k, leaf(2, 2, min(1.0, 0.5 + 0.04 * k)), leaf(3, 3, max(0.0, 0.5 - 0.04 * k))) for k in range(2, 60)]
-    moments = story(slow, 0)
+    moments = trace_hypotheses(slow, 0)
     rivalry = {"event": 0, "evidence": 1, "by_odometry": 0.6}
-    found = [Reentry({"family": "twins"}, rivalry, moments, verdict(moments, 1))]
+    found = [Reentry({"family": "twins"}, rivalry, moments, judge_reentry(moments, 1))]
     # Over 0.95 from event 12 on, which is 5.5 m after the evidence.
     assert "| twins, not decided by it | 1 | 0 | 0 | 1 | 1 |" in settling_table(found)
     assert "| twins, decided by odometry | 0 | 0 | 0 | 0 | 0 |" in settling_table(found)

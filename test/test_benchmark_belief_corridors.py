@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from benchmark.belief_corridors import drawn_building, random_corridors
+from benchmark.belief_corridors import draw_building, random_corridors
 
 
 def test_a_building_has_what_its_map_has_where_that_is_certain_and_less_where_it_is_not():
     random = np.random.default_rng(0)
     known = random_corridors(random, 2, 2, 0.2)
-    there = drawn_building(random, known)
+    there = draw_building(random, known)
     listed = sum(len(way.landmarks.tracks) for way in known.ways)
     standing = sum(len(way.landmarks.tracks) for way in there.ways)
     expected = sum(float(way.landmarks.probabilities.sum()) for way in known.ways)

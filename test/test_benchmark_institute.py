@@ -14,8 +14,8 @@ from benchmark.institute import (
     recovery,
     way_length,
 )
-from benchmark.institute_maps import InstituteMap, judged, scenario_of
-from benchmark.report import VALIDATION, marks
+from benchmark.institute_maps import InstituteMap, scenario_of, score_chart
+from benchmark.report import VALIDATION, document_marks
 from hmt_slam_ros.exploration.rooms import Destination
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -109,7 +109,7 @@ def chart_of_states(changed=()):
 
 
 def test_a_chart_of_the_states_has_all_and_confuses_none():
-    found = judged(chart_of_states())
+    found = score_chart(chart_of_states())
     assert (found.states, found.detected, found.confused) == (13, 13, 0)
     np.testing.assert_allclose(found.off, 0.1)
 
@@ -123,11 +123,11 @@ def test_a_chart_of_the_states_has_all_and_confuses_none():
     ],
 )
 def test_what_is_missing_and_what_is_confused(change, detected, confused):
-    found = judged(chart_of_states({0: change}.items()))
+    found = score_chart(chart_of_states({0: change}.items()))
     assert (found.detected, found.confused) == (detected, confused)
     assert math.isclose(max(found.off), 0.1)
 
 
 def test_the_document_has_a_place_for_it():
     text = VALIDATION.read_text()
-    assert all(text.count(mark) == 1 for mark in marks("institute"))
+    assert all(text.count(mark) == 1 for mark in document_marks("institute"))

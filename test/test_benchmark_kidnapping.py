@@ -4,14 +4,24 @@ import math
 
 import pytest
 
-from benchmark.kidnapping import KINDS, SOON, Heard, drawn, judged, kidnapped, requirements
+from benchmark.kidnapping import (
+    KINDS,
+    SOON,
+    LocalizationReport,
+    draw_drive,
+    drive_kidnapped,
+    requirements,
+    summarize_drive,
+)
 from hmt_slam_ros.open_log import open_log
 
 LOST, RIGHT, WRONG = (False, False, False), (True, True, True), (True, True, False)
 
 
 def told(*said):
-    return judged([Heard(float(k), *one) for k, one in enumerate(said)], (0.02, 0.03), float(len(said)))
+    return summarize_drive(
+        [LocalizationReport(float(k), *one) for k, one in enumerate(said)], (0.02, 0.03), float(len(said))
+    )
 
 
 @pytest.mark.parametrize(
@@ -37,7 +47,7 @@ def test_a_confident_wrong_answer_and_one_that_comes_late_are_faults():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_robot_is_carried_once_and_its_wheels_do_not_notice(kind):
-    log = open_log(drawn("ring", kind, 1))
+    log = open_log(draw_drive("ring", kind, 1))
     drive = log.scenario.settings
     assert (drive.carried > 0.5) == (kind == "known")
     assert drive.to > drive.carried
@@ -56,7 +66,7 @@ def test_the_robot_is_carried_once_and_its_wheels_do_not_notice(kind):
     ids=["among people", "where little but passed walls contradicts, keyframe by keyframe"],
 )
 def test_a_robot_notices_that_it_was_carried_and_finds_itself(world, kind, seed):
-    found = kidnapped(drawn(world, kind, seed))
+    found = drive_kidnapped(draw_drive(world, kind, seed))
     assert found.noticed <= SOON
     assert not found.wrong
     assert max(found.errors) < 0.1

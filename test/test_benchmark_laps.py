@@ -2,8 +2,8 @@
 
 import pytest
 
-from benchmark.laps import Lap, Laps, driven, requirements
-from benchmark.report import VALIDATION, marks
+from benchmark.laps import Lap, Laps, drive_laps, requirements
+from benchmark.report import VALIDATION, document_marks
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.open_log import open_log
 
@@ -34,7 +34,7 @@ def test_a_log_of_few_passes_is_compared_with_the_first():
 
 
 def test_the_laps_of_a_run_are_measured():
-    found = driven("sim:office,size=0.7,rate=1.5,laps=2", None, 2, Configuration())
+    found = drive_laps("sim:office,size=0.7,rate=1.5,laps=2", None, 2, Configuration())
     assert len(found.laps) == len(found.errors) == 2
     assert all(3 <= lap.areas <= 6 and 100 < lap.keyframes <= lap.scans + 5 for lap in found.laps)
     scans = open_log("sim:office,size=0.7,rate=1.5,laps=2").scan_count
@@ -45,4 +45,4 @@ def test_the_laps_of_a_run_are_measured():
 
 def test_the_document_has_a_place_for_the_tables():
     text = VALIDATION.read_text()
-    assert all(text.count(mark) == 1 for mark in marks("laps"))
+    assert all(text.count(mark) == 1 for mark in document_marks("laps"))

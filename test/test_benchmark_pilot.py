@@ -7,12 +7,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from benchmark.pilot import Explored, Ran, _awakening, _row, _scored, requirements
-from benchmark.report import VALIDATION, marks
+from benchmark.pilot import ExploredBuilding, TaskRun, _awakening, _row, _scored, requirements
+from benchmark.report import VALIDATION, document_marks
 from hmt_slam_ros.geometry import se2
 
 IN_MAP, IN_WORLD = np.array([1.0, 2.0, 0.3]), np.array([-4.0, 5.0, 1.0])
-BUILDING = Explored(0, Path(), {7: (IN_MAP, IN_WORLD)}, {"room 1": (7, np.array([3.0, 4.0]))})
+BUILDING = ExploredBuilding(0, Path(), {7: (IN_MAP, IN_WORLD)}, {"room 1": (7, np.array([3.0, 4.0]))})
 WORLD = "sim:institute,seed=0,people=0,laps=1"
 
 
@@ -20,7 +20,7 @@ def ran(end, text="go room 1: the robot is there", told=(0.0, 0.0, 0.0), contact
     """An errand that begins 10 m off, slam being told a pose that the robot is so far away from."""
     place = np.array([0.5, -0.5, 0.2])
     start = se2.compose(IN_MAP, place), se2.compose(se2.compose(IN_WORLD, place), np.array(told))
-    return Ran(text, np.array([(3.0, 14.0), end]), 20.0, contacts, [start])
+    return TaskRun(text, np.array([(3.0, 14.0), end]), 20.0, contacts, [start])
 
 
 def values(*errands):
@@ -51,4 +51,4 @@ def test_the_robot_wakes_up_at_the_same_place_for_the_same_building():
 
 def test_the_document_has_a_place_for_it():
     text = VALIDATION.read_text()
-    assert all(text.count(mark) == 1 for mark in marks("pilot"))
+    assert all(text.count(mark) == 1 for mark in document_marks("pilot"))

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmark.policies import requirements, share
+from benchmark.policies import requirements, share_within
 from benchmark.simulated.truth import crossings_of, doors_of
 from benchmark.simulated.watch import watched
 from benchmark.simulated.worlds import INSTITUTE, World
@@ -52,9 +52,9 @@ def record(doors, portals, wrong=0, error=0.1):
 
 def test_what_is_near_counts_and_what_is_nowhere_does_not():
     own = [record([0.2, None], [0.1, 0.6]), record([1.5], [])]
-    assert share(own, "doors", 1.0) == pytest.approx(1 / 3)
-    assert share(own, "portals", 0.5) == pytest.approx(0.5)
-    assert math.isnan(share([record([], [])], "doors", 1.0))
+    assert share_within(own, "doors", 1.0) == pytest.approx(1 / 3)
+    assert share_within(own, "portals", 0.5) == pytest.approx(0.5)
+    assert math.isnan(share_within([record([], [])], "doors", 1.0))
 
 
 def test_a_policy_is_judged_by_doors_closures_and_the_error_by_ncut():

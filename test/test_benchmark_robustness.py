@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from benchmark.logs import BUNDLED, opened
-from benchmark.robustness import Verdict, closure_errors, verdict
+from benchmark.logs import BUNDLED, open_logs
+from benchmark.robustness import Verdict, closure_errors, judge_run
 from benchmark.runs import Case, Runner
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
@@ -87,7 +87,7 @@ def test_a_map_of_the_right_topology_is_told_from_wrong_ones():
 
 def test_runs_with_degraded_odometry_are_judged_and_a_failed_one_is_wrong(tmp_path):
     """Real runs of the beginning of the bundled log; the path of the first is taken for the truth."""
-    with opened([BUNDLED]) as (bundled,):
+    with open_logs([BUNDLED]) as (bundled,):
         relations = tmp_path / "relations"
         log = replace(bundled, relations_file=relations)
         runner = Runner(tmp_path / "runs", jobs=1)
@@ -98,8 +98,8 @@ def test_runs_with_degraded_odometry_are_judged_and_a_failed_one_is_wrong(tmp_pa
         path = read_tum(reference.folder / "trajectory.tum")
         last = se2.between(path.poses[0], path.poses[-1])
         relations.write_text(f"{path.stamps[0] / 1e9} {path.stamps[-1] / 1e9} {last[0]} {last[1]} 0 0 0 {last[2]}\n")
-        assert verdict(reference, reference).scores.overall.translation.max == pytest.approx(0.0, abs=1e-6)
-        assert verdict(degraded, reference).scores.overall.translation.max > 1e-4
-        assert verdict(failed, reference) == Verdict(None)
+        assert judge_run(reference, reference).scores.overall.translation.max == pytest.approx(0.0, abs=1e-6)
+        assert judge_run(degraded, reference).scores.overall.translation.max > 1e-4
+        assert judge_run(failed, reference) == Verdict(None)
         with pytest.raises(HmtSlamError, match="no such kind"):
             runner.runs([failed.case])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmark.simulated.loops import Loops
-from benchmark.simulated.records import Records, code, read_record, write_comparisons
+from benchmark.simulated.records import Records, code_hash, read_record, write_comparisons
 from benchmark.simulated.truth import Truth, nees
 from benchmark.simulated.worlds import FAMILIES, LONG, SETTINGS, World, seeds
 from hmt_slam_ros.configuration import load_configuration
@@ -27,8 +27,8 @@ def keyframes_of(log, spacing=10):
     """Keyframe events of every so many scans of a drive, without leaves."""
     scans = [r.measurement for r in log.records() if isinstance(r.measurement, Scan)][::spacing]
     path = log.true_poses(np.array([scan.stamp for scan in scans]))
-    travelled = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
-    return [Keyframe(k, scan, float(way), ()) for k, (scan, way) in enumerate(zip(scans, travelled, strict=True))]
+    traveled = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
+    return [Keyframe(k, scan, float(way), ()) for k, (scan, way) in enumerate(zip(scans, traveled, strict=True))]
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def test_watching_changes_nothing_of_a_run(record):
 
 def test_a_record_holds_what_the_four_measurements_need(record):
     _, watched = record
-    assert watched["code"] == code()
+    assert watched["code"] == code_hash()
     assert sum(loop["can_be_closed"] for loop in watched["loops"]) == 1
     assert len(watched["poses"]) > 50
     assert all(pose["map"]["nees"] >= 0.0 for pose in watched["poses"])

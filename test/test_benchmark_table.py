@@ -8,7 +8,15 @@ import pytest
 from benchmark.charted_run import OneArea
 from benchmark.logs import MeasuredLog
 from benchmark.runs import Run
-from benchmark.table import Comparison, Entry, KeptRunner, compared, comparison_table, metric_case, requirements
+from benchmark.table import (
+    CachedRunner,
+    Comparison,
+    Entry,
+    comparison_table,
+    metric_case,
+    open_compared_logs,
+    requirements,
+)
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import AreaEvents, Hypotheses
@@ -61,17 +69,17 @@ def test_a_run_is_kept_and_made_anew_for_another_program(tmp_path, monkeypatch):
     monkeypatch.setattr("benchmark.runs.run_case", run_case)
     case = metric_case(LOG, 0, (), 12)
     for _ in range(2):
-        (run,) = KeptRunner(tmp_path, 1).runs([case])
+        (run,) = CachedRunner(tmp_path, 1).runs([case])
         assert (run.cpu_seconds, run.wall_seconds, run.peak_rss) == (5.0, 6.0, 7)
     assert len(runs) == 1
     usage = runs[0] / "usage.json"
     usage.write_text(json.dumps(json.loads(usage.read_text()) | {"code": "older"}))
-    KeptRunner(tmp_path, 1).runs([case])
+    CachedRunner(tmp_path, 1).runs([case])
     assert len(runs) == 2
 
 
 def test_a_name_that_is_no_log_is_refused():
-    with pytest.raises(HmtSlamError, match="there is no log 'atlantis'"), compared(["atlantis"]):
+    with pytest.raises(HmtSlamError, match="there is no log 'atlantis'"), open_compared_logs(["atlantis"]):
         pass
 
 

@@ -7,7 +7,7 @@ import pytest
 from worlds import box, scan_at, scan_in
 
 from benchmark import lines as measured
-from benchmark.line_truth import difference, lines_of, seen_in
+from benchmark.line_truth import line_difference, lines_of, true_scan
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
@@ -36,7 +36,7 @@ def test_lines_are_as_far_off_as_they_say(beams, field_of_view):
         lines = extract_lines(scan, FEATURES)
         walls = lines_of(se2.transform(se2.inverse(pose), ROOM.reshape(-1, 2)).reshape(-1, 4))
         for line, covariance in zip(lines.parameters, lines.covariances, strict=True):
-            errors = difference(line, walls)
+            errors = line_difference(line, walls)
             nees.append(np.einsum("ni,ij,nj->n", errors, np.linalg.inv(covariance), errors).min())
     assert len(nees) >= 100
     # The mean of so many is within three deviations of its own, and a few percent for beams that were left out.
@@ -135,7 +135,7 @@ def test_lines_of_a_simulated_drive_are_measured_against_its_walls(monkeypatch):
     assert 1.0 < measured.mean_nees([scans]) < 4.0
     assert 0.0 < measured.milliseconds([scans]) < 1000.0
     scenario = open_simulated("sim:twins,seed=3,people=2,sweep=0.1").scenario
-    seen = seen_in(scenario, 40)
+    seen = true_scan(scenario, 40)
     assert np.hypot(*(seen.scan.points - seen.ends).T).max() < 0.1
     assert set(np.unique(seen.met)) <= set(range(-1, len(seen.lines)))
 

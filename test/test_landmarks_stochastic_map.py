@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmark.linemap import mapped
+from benchmark.linemap import map_rooms
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
@@ -186,7 +186,7 @@ def test_a_scan_without_lines_changes_nothing():
 
 @pytest.mark.parametrize("kind", ["room", "busy office"])
 def test_a_simulated_room_is_mapped_to_the_centimetre(kind):
-    drive = mapped(kind, 3, "laps=1,rate=2,field_of_view=360,beams=360", Configuration())
+    drive = map_rooms(kind, 3, "laps=1,rate=2,field_of_view=360,beams=360", Configuration())
     assert drive.pose_nees.mean() < 9.0
     assert 2.0 * drive.pose_sigmas[:, :2].mean() < 0.01
     assert np.abs(drive.pose_errors[:, :2]).max() < 0.03

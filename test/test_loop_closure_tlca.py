@@ -51,7 +51,7 @@ def test_a_dominant_path_is_accepted_after_enough_keyframes_since_the_paths_part
 def test_a_dominant_path_is_accepted_after_enough_metres_since_the_paths_parted():
     play = Play(accept_keyframes=1, accept_distance=2.0)
     assert parted(play).hypothesis is None  # parted at 0.5 m
-    assert [play.step(*both(), travelled=t).hypothesis for t in (1.0, 2.4, 2.5)] == [None, None, 1]
+    assert [play.step(*both(), traveled=t).hypothesis for t in (1.0, 2.4, 2.5)] == [None, None, 1]
 
 
 def test_keyframes_count_only_in_a_row():

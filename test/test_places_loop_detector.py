@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from benchmark.belief_corridors import Corridors, drawn_building, random_corridors
-from benchmark.belief_world import drawn_of_present
+from benchmark.belief_corridors import Corridors, draw_building, random_corridors
+from benchmark.belief_world import draw_of_present
 from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
 from hmt_slam_ros.places.loop_detector import TwoPeakTracker, initial_loop_belief
 from hmt_slam_ros.places.observation import observation_model
@@ -38,7 +38,7 @@ def mapped_twice(random, edges, turned=0, missed=0.0):
     nodes = [Node(1.0, empty_sequence(), empty_sequence())] * (2 * ROUND + 1)
     twice = []
     for k in range(2 * ROUND):
-        there = drawn_building(random, Corridors([], [edges[k % ROUND]])).ways[0]
+        there = draw_building(random, Corridors([], [edges[k % ROUND]])).ways[0]
         known = edges[k % ROUND].landmarks
         listed = there.landmarks._replace(
             variances=np.full((len(there.landmarks.tracks), 2), known.variances[0] if len(known.tracks) else 0.0),
@@ -62,7 +62,7 @@ def driven(random, belief, detector, edges, start, count):
         length = random.normal(own.distance[0], 0.05)
         belief = belief.predict_arrival(Travel(length, random.normal(0.0, 0.02), NOISE))
         ahead = edges[(k + 1) % ROUND].landmarks
-        seen = drawn_of_present(random, ahead, np.ones(len(ahead.tracks), bool), 0.0, MODEL)
+        seen = draw_of_present(random, ahead, np.ones(len(ahead.tracks), bool), 0.0, MODEL)
         belief = belief.update(ahead_only(seen), MODEL, 0.0, 0.01)
         yield detector.update(belief), belief
 
@@ -93,7 +93,7 @@ def test_no_loop_is_proposed_where_there_is_none():
         random = np.random.default_rng(seed)
         corridors = random_corridors(random, 1, 2, 0.1)
         graph = build_place_graph(corridors.nodes, corridors.edges, PLACES)
-        building = drawn_building(random, corridors)
+        building = draw_building(random, corridors)
         truth = build_place_graph(building.nodes, building.edges, PLACES)
         state = int(random.choice(np.flatnonzero(graph.successors >= 0)))
         belief, detector = initial_loop_belief(graph, PLACES), TwoPeakTracker()
@@ -102,7 +102,7 @@ def test_no_loop_is_proposed_where_there_is_none():
             state = int(graph.successors[state])
             own = slice(*truth.expected_landmarks.starts[state : state + 2])
             there = LandmarkSequence(*(field[own] for field in truth.expected_landmarks.landmarks))
-            seen = drawn_of_present(random, there, np.ones(len(there.tracks), bool), 0.0, MODEL)
+            seen = draw_of_present(random, there, np.ones(len(there.tracks), bool), 0.0, MODEL)
             belief = belief.predict_arrival(travel).update(seen, MODEL, 0.0, 0.01)
             assert detector.update(belief) is None
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmark.belief_corridors import random_corridors
-from benchmark.belief_world import drawn_anywhere, drawn_observation
+from benchmark.belief_world import draw_clutter, draw_observation
 from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
 from hmt_slam_ros.places.observation import log_observation_ratios, log_unknown_ground_ratio, observation_model
 from hmt_slam_ros.places.observation_graph import LandmarkSequence, empty_sequence, merge_sequences
@@ -87,7 +87,7 @@ def test_two_ways_in_one_direction_are_refused():
 
 
 def transition(graph, places, action):
-    """T(s, a, s') times the density of what was travelled, by the book, shape (states + 1, states + 1)."""
+    """T(s, a, s') times the density of what was traveled, by the book, shape (states + 1, states + 1)."""
     n = graph.state_count
     if not isinstance(action, Travel):
         quarters = action
@@ -128,7 +128,7 @@ def test_the_belief_is_that_of_an_enumeration_of_all_paths(seed):
         action = random.choice(4)
         action = Travel(*random.normal((3.0, 0.0), (0.5, 0.1)), (0.01, 0.01)) if action in (0, 1) else int(action - 2)
         away, variance = random.uniform(0.0, 1.0), 0.02
-        graph_seen = drawn_anywhere(random, 0.1, 0.1, MODEL)
+        graph_seen = draw_clutter(random, 0.1, 0.1, MODEL)
         if isinstance(action, Travel):
             belief = belief.predict_arrival(action)
         elif action:
@@ -216,7 +216,7 @@ def test_where_the_map_ends_unknown_ground_begins():
     assert there.probabilities[-1] > 0.98
 
 
-def test_the_travelled_distance_tells_openings_apart():
+def test_the_traveled_distance_tells_openings_apart():
     graph = chain([3.0, 4.0])
     start = certain_belief(graph, PLACES, state_of(0, EAST))
     assert start.predict_arrival(Travel(3.1, 0.0, (0.01, 0.01))).most_likely_state == state_of(1, EAST)
@@ -261,9 +261,9 @@ def drawn_transition(random, graph, places, state, action):
 
 def drawn_seen(random, graph, state):
     if state == graph.state_count:
-        return drawn_anywhere(random, MODEL.usual_density, MODEL.false_density, MODEL)
+        return draw_clutter(random, MODEL.usual_density, MODEL.false_density, MODEL)
     own = slice(*graph.expected_landmarks.starts[state : state + 2])
-    return drawn_observation(
+    return draw_observation(
         random, LandmarkSequence(*(f[own] for f in graph.expected_landmarks.landmarks)), 0.0, 0.01, MODEL
     )
 

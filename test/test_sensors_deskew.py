@@ -102,7 +102,7 @@ def steady(*stamps):
 
 
 @pytest.mark.parametrize(
-    ("stamps", "start", "end", "travelled"),
+    ("stamps", "start", "end", "traveled"),
     [
         ((0, 20, 40, 60, 80, 100), 10, 90, 0.08),
         ((0, 100), 0, 100, 0.1),
@@ -114,10 +114,10 @@ def steady(*stamps):
         ((), 0, 100, 0.0),
     ],
 )
-def test_motion_is_interpolated_and_goes_on_for_a_while_after_the_last_reading(stamps, start, end, travelled):
+def test_motion_is_interpolated_and_goes_on_for_a_while_after_the_last_reading(stamps, start, end, traveled):
     buffer = steady(*stamps)
     buffer.pose_at(start * MS)
-    np.testing.assert_allclose(buffer.twist_between(start * MS, end * MS), (travelled, 0.0, 0.0), atol=1e-12)
+    np.testing.assert_allclose(buffer.twist_between(start * MS, end * MS), (traveled, 0.0, 0.0), atol=1e-12)
 
 
 def blank(stamp, increment, beams=101):

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmark.awakening import FAR, awakened, mapped
-from benchmark.kidnapping import SOON, kidnapped
+from benchmark.awakening import FAR, map_log, try_start
+from benchmark.kidnapping import SOON, drive_kidnapped
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -27,7 +27,7 @@ OFF = np.array([5.0, 0.0, 0.0])
 
 @pytest.fixture(scope="module")
 def maps():
-    return mapped(WORLD, Configuration())
+    return map_log(WORLD, Configuration())
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office, b
 @pytest.mark.parametrize(("kind", "share"), [("whole", 0.15), ("whole", 0.7), ("first half", 0.5)])
 def test_it_is_recognized_where_it_is(maps, kind, share):
     log = maps[kind]
-    found = awakened(log, log.starts[int(share * len(log.starts))])
+    found = try_start(log, log.starts[int(share * len(log.starts))])
     assert found.right
     assert not found.wrong
     assert found.found <= FAR
@@ -81,7 +81,7 @@ def test_it_is_recognized_where_it_is(maps, kind, share):
 def test_without_landmarks_as_prior_it_is_recognized_too(maps, share):
     log = maps["first half"]
     asked = replace(log, configuration=with_changes(Configuration(), {"places.prior": False}))
-    found = awakened(asked, log.starts[int(share * len(log.starts))])
+    found = try_start(asked, log.starts[int(share * len(log.starts))])
     assert found.right
     assert not found.wrong
     assert found.found <= FAR
@@ -154,7 +154,7 @@ def test_scans_are_counted_on_and_odometry_begins_anew(office, begin):
 
 
 def test_one_that_is_carried_while_it_maps_notices_and_is_recognized():
-    found = kidnapped(CARRIED)
+    found = drive_kidnapped(CARRIED)
     assert found.noticed <= SOON
     assert found.again <= FAR
     assert not found.confident

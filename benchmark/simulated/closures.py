@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from benchmark.simulated.examinations import Examination, known_is_right, new_is_right
-from benchmark.simulated.truth import Claim, Truth
+from benchmark.simulated.truth import PlacementError, Truth
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.map_changes import Arc
@@ -24,13 +24,13 @@ class Closure:
     :ivar event: the keyframe event.
     :ivar way: "cut" or "recheck" where it was one of several answers; "tracked" where the robot was known to be there.
     :ivar areas: the area that the robot was in, and the known one.
-    :ivar claim: how right that is.
+    :ivar assess: how right that is.
     """
 
     event: int
     way: str
     areas: tuple[int, int]
-    claim: Claim
+    assessment: PlacementError
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,80 +59,89 @@ class Paths:
         self._truth = truth
         self.paths: Mapping[int, Path] = {FIRST_HYPOTHESIS: Path()}
 
-    def follow(self, hypotheses: Hypotheses, replica: Replica, asked: Mapping[int, Examination]) -> None:
+    def follow(self, hypotheses: Hypotheses, replica: Replica, examinations: Mapping[int, Examination]) -> None:
         """Learn of TSBI's answer.
 
         :param replica: as it was before.
-        :param asked: {parent: what it asked at this event}.
+        :param examinations: {parent: what it asked at this event}.
         """
         self.paths = {
-            leaf.id: self._followed(leaf, hypotheses.sequence, replica.maps[leaf.parent], asked)
-            for leaf in hypotheses.hypotheses
+            hypothesis.id: self._continue(
+                hypothesis, hypotheses.sequence, replica.maps[hypothesis.parent], examinations
+            )
+            for hypothesis in hypotheses.hypotheses
         }
 
-    def _followed(self, leaf: Hypothesis, event: int, before: HybridMap, asked: Mapping[int, Examination]) -> Path:
-        path = self.paths[leaf.parent]
-        examination = asked.get(leaf.parent)
-        found = [self._closure(leaf, arc, event, before, examination) for arc in closing(leaf, before, examination)]
-        path = replace(path, closures=(*path.closures, *found))
-        path = replace(path, wrong=path.wrong or not all(closure.claim.true for closure in found))
+    def _continue(
+        self, hypothesis: Hypothesis, event: int, before: HybridMap, examinations: Mapping[int, Examination]
+    ) -> Path:
+        path = self.paths[hypothesis.parent]
+        examination = examinations.get(hypothesis.parent)
+        closures = [
+            self._closure(hypothesis, arc, event, before, examination)
+            for arc in closing_arcs(hypothesis, before, examination)
+        ]
+        path = replace(path, closures=(*path.closures, *closures))
+        path = replace(path, wrong=path.wrong or not all(closure.assessment.true for closure in closures))
         if examination is None:
             return path
-        return replace(path, missing=not found and not new_is_right(examination, self._truth))
+        return replace(path, missing=not closures and not new_is_right(examination, self._truth))
 
     def _closure(
-        self, leaf: Hypothesis, arc: Arc, event: int, before: HybridMap, examination: Examination | None
+        self, hypothesis: Hypothesis, arc: Arc, event: int, before: HybridMap, examination: Examination | None
     ) -> Closure:
-        known_area = known_end(leaf, arc)
+        known_area = known_end(hypothesis, arc)
         other, pose = (arc.source, arc.pose.inverse()) if arc.target == known_area else (arc.target, arc.pose)
-        joined = {
-            r.keyframe: r.pose for r in leaf.moved_keyframes if r.area == known_area and r.previous_area != r.area
+        moved_keyframes = {
+            r.keyframe: r.pose for r in hypothesis.moved_keyframes if r.area == known_area and r.previous_area != r.area
         }
-        recent = examination.keyframes if examination else list(before.keyframes(other))[-_RECENT:]
-        staying = {k: se2.compose(pose.mean, at) for k, at in before.keyframes(other).items() if k in recent}
-        known, asked = before.keyframes(known_area), joined or staying
-        claim = self._truth.claim(known, asked, pose.covariance, pose.mean)
+        recent_keyframes = examination.keyframes if examination else list(before.keyframes(other))[-_RECENT:]
+        recent_poses = {
+            k: se2.compose(pose.mean, at) for k, at in before.keyframes(other).items() if k in recent_keyframes
+        }
+        known, examinations = before.keyframes(known_area), moved_keyframes or recent_poses
+        assessment = self._truth.assess(known, examinations, pose.covariance, pose.mean)
         way = examination.kind if examination else "tracked"
-        return Closure(event, way, (other, known_area), claim)
+        return Closure(event, way, (other, known_area), assessment)
 
     def accepted(self, hypothesis: int, chosen: HybridMap) -> list[Closure]:
         """The closures that become definite with a hypothesis, judged as they now are."""
         path = self.paths[hypothesis]
         self.paths = {hypothesis: replace(path, wrong=False, closures=())}
-        return [self._judged_again(closure, chosen) for closure in path.closures]
+        return [self._reassess(closure, chosen) for closure in path.closures]
 
-    def _judged_again(self, closure: Closure, chosen: HybridMap) -> Closure:
+    def _reassess(self, closure: Closure, chosen: HybridMap) -> Closure:
         """By the same keyframes; where one of them left the two areas, the verdict stands."""
         other, known_area = closure.areas
-        known, asked = closure.claim.pair
+        known, examinations = closure.assessment.pair
         pose = chosen.arc(known_area, other)
         ours, theirs = chosen.keyframes(known_area), chosen.keyframes(other)
-        if pose is None or known not in ours or asked not in {*ours, *theirs}:
+        if pose is None or known not in ours or examinations not in {*ours, *theirs}:
             return closure
-        at = ours[asked] if asked in ours else se2.compose(pose.mean, theirs[asked])
-        claim = self._truth.claim({known: ours[known]}, {asked: at}, pose.covariance, pose.mean)
-        return replace(closure, claim=claim)
+        at = ours[examinations] if examinations in ours else se2.compose(pose.mean, theirs[examinations])
+        assessment = self._truth.assess({known: ours[known]}, {examinations: at}, pose.covariance, pose.mean)
+        return replace(closure, assessment=assessment)
 
 
-def closing(leaf: Hypothesis, before: HybridMap, examination: Examination | None) -> Iterator[Arc]:
+def closing_arcs(hypothesis: Hypothesis, before: HybridMap, examination: Examination | None) -> Iterator[Arc]:
     """The arcs by which a leaf says where in a known area the robot is.
 
     They close a loop that its parent had not closed, or are measured anew by keyframes that TSBI found in the area.
     """
-    if leaf.removed_arcs:
+    if hypothesis.removed_arcs:
         return  # a question that TLCA opened again: nothing was observed
-    found = examination is not None and bool(leaf.moved_keyframes) and leaf.area in before.area_ids()
-    for arc in leaf.arcs:
+    found = examination is not None and bool(hypothesis.moved_keyframes) and hypothesis.area in before.area_ids()
+    for arc in hypothesis.arcs:
         value = before.arc_value(arc.source, arc.target)
         if found or (arc.closure and (value is None or not value.closure)):
             yield arc
 
 
-def known_end(leaf: Hypothesis, arc: Arc) -> int:
+def known_end(hypothesis: Hypothesis, arc: Arc) -> int:
     """The known one of the two areas of an arc: that which keyframes moved to, else that in which the robot is not."""
-    if leaf.moved_keyframes:
-        return leaf.area
-    return arc.target if arc.source == leaf.area else arc.source
+    if hypothesis.moved_keyframes:
+        return hypothesis.area
+    return arc.target if arc.source == hypothesis.area else arc.source
 
 
 @dataclass(frozen=True)
@@ -149,28 +158,28 @@ class Answer:
     right: bool
 
 
-NEW, NOT_ASKED = -1, -2
+NEW, NOT_EXAMINED = -1, -2
 
 
-def answers(
-    hypotheses: Hypotheses, before: Replica, asked: Mapping[int, Examination], paths: Mapping[int, Path]
+def live_answers(
+    hypotheses: Hypotheses, before: Replica, examinations: Mapping[int, Examination], paths: Mapping[int, Path]
 ) -> list[Answer]:
     """The PMF over the live hypotheses after an event, by what each answered.
 
     :param paths: after the event.
     """
     found = []
-    for leaf in hypotheses.hypotheses:
-        examination = asked.get(leaf.parent)
-        arcs = list(closing(leaf, before.maps[leaf.parent], examination))
-        area = NOT_ASKED if examination is None else known_end(leaf, arcs[0]) if arcs else NEW
-        found.append(Answer(area, leaf.probability, paths[leaf.id].right))
+    for hypothesis in hypotheses.hypotheses:
+        examination = examinations.get(hypothesis.parent)
+        arcs = list(closing_arcs(hypothesis, before.maps[hypothesis.parent], examination))
+        area = NOT_EXAMINED if examination is None else known_end(hypothesis, arcs[0]) if arcs else NEW
+        found.append(Answer(area, hypothesis.probability, paths[hypothesis.id].right))
     return found
 
 
-def by_arcs_alone(
+def answers_by_arcs(
     hypotheses: Iterable[tuple[int, float]],
-    asked: Mapping[int, Examination],
+    examinations: Mapping[int, Examination],
     paths: Mapping[int, Path],
     truth: Truth,
 ) -> list[tuple[Answer, int]]:
@@ -182,10 +191,10 @@ def by_arcs_alone(
     found = []
     for hypothesis, probability in hypotheses:
         wrong = paths[hypothesis].wrong
-        if hypothesis not in asked:
-            found.append((Answer(NOT_ASKED, probability, paths[hypothesis].right), 0))
+        if hypothesis not in examinations:
+            found.append((Answer(NOT_EXAMINED, probability, paths[hypothesis].right), 0))
             continue
-        examination = asked[hypothesis]
+        examination = examinations[hypothesis]
         model = examination.found.transition
         right = not wrong and new_is_right(examination, truth)
         found.append((Answer(NEW, probability * model.new, right), len(model.known)))

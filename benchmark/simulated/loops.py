@@ -38,7 +38,7 @@ VIEW = 0.5
 GRACE = 10.0
 """Path beyond the known ground within which a loop still counts as closed in time, m."""
 
-_LOOKED_AT = 10.0  # m of the known ground, on half of whose keyframes the view must be shared
+_VIEW_STRETCH = 10.0  # m of the known ground, on half of whose keyframes the view must be shared
 _PARTNERS = 3
 
 ALIKE_VIEW, ALIKE_BEAMS = 0.1, 0.05
@@ -91,51 +91,51 @@ class Loops:
 
     def __init__(self, truth: Truth) -> None:
         self._truth = truth
-        self._travelled: dict[int, float] = {}
+        self._traveled: dict[int, float] = {}
         self.found: list[Loop] = []
         self._new_ground = 0.0
         self._before = 0.0
 
-    def note(self, event: int, travelled: float, known: HybridMap, area: int) -> None:
+    def add_event(self, event: int, traveled: float, known: HybridMap, area: int) -> None:
         """Learn of a keyframe event.
 
         :param known: the map of the most probable hypothesis before it.
         :param area: the robot's area there.
         """
-        old = [k for k, at in self._travelled.items() if at <= travelled - OLD]
+        old = [k for k, at in self._traveled.items() if at <= traveled - OLD]
         partners = self._partners(event, old)
-        self._travelled[event] = travelled
-        step, self._before = travelled - self._before, travelled
+        self._traveled[event] = traveled
+        step, self._before = traveled - self._before, traveled
         if not partners:
             self._new_ground += step
             return
         if not self.found or self._new_ground >= AWAY:
-            length = travelled - max(self._travelled[k] for k in partners)
-            linked = _linked(known, _areas(known), area, partners)
-            self.found.append(Loop(event, travelled, travelled, length, linked=linked))
+            length = traveled - max(self._traveled[k] for k in partners)
+            linked = _is_linked(known, _area_of_keyframes(known), area, partners)
+            self.found.append(Loop(event, traveled, traveled, length, linked=linked))
         self._new_ground = 0.0
         self.found[-1].partners[event] = partners
-        self.found[-1].end = travelled
+        self.found[-1].end = traveled
 
-    def definite(self, event: int, known: HybridMap, area: int) -> None:
+    def update_definite(self, event: int, known: HybridMap, area: int) -> None:
         """Learn of the definite map at a keyframe event, and of the robot's area in it."""
         unclosed = [loop for loop in self.found if loop.closed_at is None]
-        areas = _areas(known) if unclosed else {}
+        areas = _area_of_keyframes(known) if unclosed else {}
         for loop in unclosed:
-            where = {k: areas[k] for k in loop.partners if k in areas}
+            area_of_event = {k: areas[k] for k in loop.partners if k in areas}
             if event in loop.partners:
                 # Keyframes that tell nothing new are in no area.
-                where[event] = area
-            if any(_linked(known, areas, own, loop.partners[k]) for k, own in where.items()):
-                loop.closed_at, loop.closed_by_event = self._travelled[event], event
+                area_of_event[event] = area
+            if any(_is_linked(known, areas, area_then, loop.partners[k]) for k, area_then in area_of_event.items()):
+                loop.closed_at, loop.closed_by_event = self._traveled[event], event
 
     def finish(self) -> None:
         """Work out what of each loop could be seen."""
         for loop in self.found:
             if not loop.linked and loop.end - loop.begin >= STAY:
-                first = [k for k in loop.partners if self._travelled[k] <= loop.begin + _LOOKED_AT]
-                seen = [self._truth.shared_view(k, loop.partners[k]).max() >= VIEW for k in first]
-                loop.view = float(np.mean(seen))
+                first = [k for k in loop.partners if self._traveled[k] <= loop.begin + _VIEW_STRETCH]
+                is_shared = [self._truth.shared_view(k, loop.partners[k]).max() >= VIEW for k in first]
+                loop.view = float(np.mean(is_shared))
 
     def _partners(self, event: int, old: list[int]) -> tuple[int, ...]:
         """The old keyframes in whose place the robot is, the nearest of them."""
@@ -147,12 +147,12 @@ class Loops:
         return tuple(sorted(near, key=lambda k: float(np.hypot(*(self._truth.poses[k] - here)[:2])))[:_PARTNERS])
 
 
-def _areas(hybrid_map: HybridMap) -> dict[int, int]:
+def _area_of_keyframes(hybrid_map: HybridMap) -> dict[int, int]:
     """{keyframe: its area}."""
     return {k: area for area in hybrid_map.area_ids() for k in hybrid_map.keyframes(area)}
 
 
-def _linked(hybrid_map: HybridMap, areas: Mapping[int, int], area: int, keyframes: tuple[int, ...]) -> bool:
+def _is_linked(hybrid_map: HybridMap, areas: Mapping[int, int], area: int, keyframes: tuple[int, ...]) -> bool:
     """Whether one of the keyframes is in an area or in one beside it."""
     near = {area, *hybrid_map.neighbors(area)}
     return any(areas.get(keyframe) in near for keyframe in keyframes)
@@ -165,46 +165,46 @@ class Rivalry:
     :ivar event: the first keyframe event there.
     :ivar since: the last keyframe event at which the robot knew where it was: the last before it saw nothing, or where
         it always saw something, when it was there last.
-    :ivar by_odometry: probability of the true place among all that look the same, by odometry alone since then.
+    :ivar odometry_probabilities: probability of the true place among all that look the same, by odometry alone since then.
     :ivar evidence: the first keyframe event at which the view is not the same in all of them; None where that is never.
     """
 
     event: int
     since: int
-    by_odometry: float
+    odometry_probabilities: float
     evidence: int | None
 
 
-def rivalries(log: SimulatedLog, truth: Truth, loops: list[Loop], travelled: Mapping[int, float]) -> list[Rivalry]:
+def find_rivalries(log: SimulatedLog, truth: Truth, loops: list[Loop], traveled: Mapping[int, float]) -> list[Rivalry]:
     """All of a drive.
 
     :param loops: the places that the robot entered again.
-    :param travelled: {keyframe event: path length since the start, m}.
+    :param traveled: {keyframe event: path length since the start, m}.
     """
-    moves = _moves(log.scenario.building.twin_frames)
-    found = [_rivalry(log, truth, loop, moves, travelled) for loop in loops if moves]
+    moves = _twin_motions(log.scenario.building.twin_frames)
+    found = [_find_rivalry(log, truth, loop, moves, traveled) for loop in loops if moves]
     return [rivalry for rivalry in found if rivalry is not None]
 
 
-def _rivalry(
-    log: SimulatedLog, truth: Truth, loop: Loop, moves: list[Pose], travelled: Mapping[int, float]
+def _find_rivalry(
+    log: SimulatedLog, truth: Truth, loop: Loop, moves: list[Pose], traveled: Mapping[int, float]
 ) -> Rivalry | None:
     for event, partners in loop.partners.items():
         here = truth.poses[event]
-        old = np.array([truth.poses[k] for k, at in travelled.items() if at <= travelled[event] - OLD])
-        images = [move for move in moves if _known(log, se2.compose(move, here), old)]
+        old = np.array([truth.poses[k] for k, at in traveled.items() if at <= traveled[event] - OLD])
+        images = [move for move in moves if _is_known_place(log, se2.compose(move, here), old)]
         rivals = [move for move in images if looks_alike(log, here, se2.compose(move, here))]
         if rivals:
             since = _last_certain(log, truth, event, max(partners))
             poses = [here, *(se2.compose(move, here) for move in rivals)]
-            weights = by_odometry(log, truth, since, event, poses)
+            weights = odometry_probabilities(log, truth, since, event, poses)
             later = (k for k in loop.partners if k >= event)
-            evidence = next((k for k in later if not _any_alike(log, truth.poses[k], rivals)), None)
+            evidence = next((k for k in later if not _is_any_alike(log, truth.poses[k], rivals)), None)
             return Rivalry(event, since, float(weights[0]), evidence)
     return None
 
 
-def _moves(places: Mapping[str, Pose]) -> list[Pose]:
+def _twin_motions(places: Mapping[str, Pose]) -> list[Pose]:
     """The motions of the world, ``world_T_world``, that carry one of the places into another."""
     frames = list(places.values())
     pairs = [(a, b) for a in frames for b in frames if a is not b]
@@ -212,17 +212,17 @@ def _moves(places: Mapping[str, Pose]) -> list[Pose]:
     return [move for k, move in enumerate(moves) if not any(np.allclose(move, other) for other in moves[:k])]
 
 
-def _known(log: SimulatedLog, image: Pose, poses: Pose) -> bool:
+def _is_known_place(log: SimulatedLog, image: Pose, poses: Pose) -> bool:
     return bool(same_place(log.scenario.walls, image[None], poses, ALIKE_RADIUS).any())
 
 
-def _any_alike(log: SimulatedLog, pose: Pose, moves: list[Pose]) -> bool:
+def _is_any_alike(log: SimulatedLog, pose: Pose, moves: list[Pose]) -> bool:
     return any(looks_alike(log, pose, se2.compose(move, pose)) for move in moves)
 
 
 def looks_alike(log: SimulatedLog, pose: Pose, image: Pose) -> bool:
     """Whether a laser without noise sees the same from two poses, and something at all."""
-    views = [_view(log, at) for at in (pose, image)]
+    views = [_noiseless_ranges(log, at) for at in (pose, image)]
     seen = [np.isfinite(view) for view in views]
     differs = seen[0] != seen[1]
     both = seen[0] & seen[1]
@@ -230,17 +230,17 @@ def looks_alike(log: SimulatedLog, pose: Pose, image: Pose) -> bool:
     return bool(seen[0].any() and np.mean(differs) <= ALIKE_BEAMS)
 
 
-def _view(log: SimulatedLog, pose: Pose) -> Pose:
+def _noiseless_ranges(log: SimulatedLog, pose: Pose) -> Pose:
     return log.scenario.laser.distances(pose[None], log.scenario.walls, np.empty((0, 3)))
 
 
 def _last_certain(log: SimulatedLog, truth: Truth, event: int, last_visit: int) -> int:
     """See :attr:`Rivalry.since`."""
-    blind = [k for k in range(last_visit, event) if not np.isfinite(_view(log, truth.poses[k])).any()]
+    blind = [k for k in range(last_visit, event) if not np.isfinite(_noiseless_ranges(log, truth.poses[k])).any()]
     return max(last_visit, blind[0] - 1) if blind else last_visit
 
 
-def by_odometry(log: SimulatedLog, truth: Truth, since: int, event: int, poses: list[Pose]) -> Pose:
+def odometry_probabilities(log: SimulatedLog, truth: Truth, since: int, event: int, poses: list[Pose]) -> Pose:
     """Probabilities, shape (n,), of some poses ``world_T_base`` at an event, all alike but for odometry.
 
     :param since: the event from which on there is only odometry.

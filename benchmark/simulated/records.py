@@ -31,7 +31,7 @@ _TAIL = 3  # lines of a failed run that go into a message
 
 
 @cache
-def code() -> str:
+def code_hash() -> str:
     """What the records of this code are known by: a hash of the program and its parameters."""
     digest = hashlib.sha256(PARAMETERS.read_bytes())
     for folder in ("hmt_slam_ros", "benchmark/simulated"):
@@ -68,7 +68,7 @@ class Records:
     def __init__(self, folder: Path, jobs: int) -> None:
         self.folder, self.jobs = folder, jobs
 
-    def of(self, worlds: Iterable[World], changes: Sequence[str]) -> list[Record]:
+    def make(self, worlds: Iterable[World], changes: Sequence[str]) -> list[Record]:
         """The records of some worlds, in their order.
 
         :param changes: parameters that differ from the file, as ``name=value``.
@@ -82,7 +82,7 @@ class Records:
         path = self.folder / f"{world.name}{_SUFFIX}"
         if path.is_file():
             record = read_record(path)
-            if (record["code"], record["world"], record["changes"]) == (code(), world.log, changes):
+            if (record["code"], record["world"], record["changes"]) == (code_hash(), world.log, changes):
                 return record
         module = "benchmark.simulated.watch"
         command = [sys.executable, "-m", module, world.family, str(world.seed), str(path), *changes]
@@ -90,8 +90,8 @@ class Records:
             command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
         )
         if result.returncode:
-            last_words = " | ".join(result.stderr.strip().splitlines()[-_TAIL:]) or "nothing"
-            raise HmtSlamError(f"the run {world.name} failed, it said: {last_words}")
+            last_lines = " | ".join(result.stderr.strip().splitlines()[-_TAIL:]) or "nothing"
+            raise HmtSlamError(f"the run {world.name} failed, it said: {last_lines}")
         record = read_record(path)
         print(f"{world.name}: {record['cpu_s']:.1f} CPU s", file=sys.stderr, flush=True)
         return record

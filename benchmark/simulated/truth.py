@@ -34,7 +34,7 @@ Pose = NDArray[np.float64]
 RADIUS = 2.0
 """Keyframes within this distance and in sight of each other are in the same place, m: ``tsbi.place_radius``."""
 
-GREY = 0.25
+TOLERANCE = 0.25
 """Part of the radius by which either verdict on "the same place" counts as right."""
 
 NEAR, FAR, TURN = 0.5, 2.0, 10.0
@@ -51,11 +51,11 @@ Array = NDArray[np.float64]
 _AROUND = 2.0
 
 
-class Claim(NamedTuple):
+class PlacementError(NamedTuple):
     """How right it is to say where some keyframes lie in a known area.
 
     :ivar pair: the two keyframes by which it is judged, the known one first.
-    :ivar apart: true distance of the two, m.
+    :ivar distances: true distance of the two, m.
     :ivar same_place: whether they are within the radius, the grey part included, and in sight of each other.
     :ivar translation: error of their relative pose, m.
     :ivar rotation: likewise, degrees.
@@ -89,7 +89,7 @@ class Truth:
         self.stamps: dict[int, int] = {}
         self.poses: dict[int, Pose] = {}
 
-    def note(self, keyframe: Keyframe) -> None:
+    def add_keyframe(self, keyframe: Keyframe) -> None:
         """Learn of a keyframe event."""
         self.stamps[keyframe.sequence] = keyframe.scan.stamp
         self.poses[keyframe.sequence] = self.log.true_poses(np.array([keyframe.scan.stamp]))[0]
@@ -109,28 +109,28 @@ class Truth:
 
     def frame(self, hybrid_map: HybridMap, area: int) -> Pose:
         """``world_T_area``."""
-        placed = hybrid_map.keyframes(area)
-        first = min(placed, key=lambda keyframe: (_from_origin(placed[keyframe]), keyframe))
-        return se2.compose(self.poses[first], se2.inverse(placed[first]))
+        poses = hybrid_map.keyframes(area)
+        first = min(poses, key=lambda keyframe: (_from_origin(poses[keyframe]), keyframe))
+        return se2.compose(self.poses[first], se2.inverse(poses[first]))
 
-    def claim(
-        self, known: Mapping[int, Pose], asked: Mapping[int, Pose], covariance: NDArray[np.float64], origin: Pose
-    ) -> Claim:
+    def assess(
+        self, known: Mapping[int, Pose], query: Mapping[int, Pose], covariance: NDArray[np.float64], origin: Pose
+    ) -> PlacementError:
         """Judge where keyframes are said to lie in a known area.
 
         :param known: {keyframe: ``area_T_base``} of the area.
-        :param asked: likewise of the keyframes in question.
+        :param query: likewise of the keyframes in question.
         :param covariance: of the claim, right tangent of ``area_T_origin``, shape (3, 3).
         :param origin: ``area_T_origin``, shape (3,).
         """
-        true_known, true_asked = (np.array([self.poses[k] for k in placed]) for placed in (known, asked))
+        true_known, true_asked = (np.array([self.poses[k] for k in poses]) for poses in (known, query))
         apart = np.hypot(*(true_known[:, None, :2] - true_asked[None, :, :2]).transpose(2, 0, 1))
-        same = self.same_place(list(known), list(asked), (1.0 + GREY) * RADIUS)
+        same = self.same_place(list(known), list(query), (1.0 + TOLERANCE) * RADIUS)
         # A wall may stand between the two that are nearest.
         k, m = np.unravel_index(np.argmin(np.where(same, apart, apart + 1e6)), apart.shape)
-        ours, theirs = list(known.values())[k], list(asked.values())[m]
-        claimed = se2.between(ours, theirs)
-        error = se2.between(claimed, se2.between(true_known[k], true_asked[m]))
+        ours, theirs = list(known.values())[k], list(query.values())[m]
+        estimated = se2.between(ours, theirs)
+        error = se2.between(estimated, se2.between(true_known[k], true_asked[m]))
         spread = (
             PoseGaussian(origin, covariance)
             .compose(PoseGaussian(se2.between(origin, theirs), np.zeros((3, 3))))
@@ -138,8 +138,8 @@ class Truth:
             + _WITHIN_AREAS
         )
         xi = se2.log(error)
-        return Claim(
-            (list(known)[k], list(asked)[m]),
+        return PlacementError(
+            (list(known)[k], list(query)[m]),
             float(apart[k, m]),
             bool(same[k, m]),
             float(np.hypot(error[0], error[1])),
@@ -180,13 +180,13 @@ class Doors(NamedTuple):
     middles: Array
     halves: Array
 
-    def passed(self, path: Array) -> Doors:
+    def select_passed(self, path: Array) -> Doors:
         """Those that a path (n, 2) passes."""
-        each = zip(self.poses, self.widths, strict=True)
-        chosen = np.array([any(find_crossings(path, *one)) for one in each], dtype=np.bool_)
+        openings = zip(self.poses, self.widths, strict=True)
+        chosen = np.array([any(find_crossings(path, *opening)) for opening in openings], dtype=np.bool_)
         return Doors(*(column[chosen] for column in self))
 
-    def apart(self, places: Array) -> Array:
+    def distances(self, places: Array) -> Array:
         """Distances (n, m), m, of places (m, 2) from them."""
         away = np.hypot(*(self.middles[:, None] - places[None]).transpose(2, 0, 1))
         return np.asarray(np.maximum(0.0, away - self.halves[:, None]))
@@ -206,52 +206,54 @@ def crossings_of(building: Building) -> Doors:
     return Doors(states.openings[own], states.widths[own], states.poses[own, :2], states.ahead[own])
 
 
-def doors(
+def score_openings(
     truth: Truth, hybrid_map: HybridMap, scans: Mapping[int, Scan], configuration: Configuration
 ) -> dict[str, Any]:
     """What came of the openings that the robot passed: distances, m, inf where there is nothing.
 
     :param hybrid_map: what was mapped, with its keyframes' scans.
-    :returns: ``changes``, of each change of areas along the path from a door or crossing; ``doors`` and ``crossings``
+    :returns: ``changes``, of each change of areas along the path from a door or crossing; ``score_openings`` and ``crossings``
         that were passed, from a change of areas each; ``portals``, from any true gap between walls, a door or not; and
         ``doors_portals``, of each door from a portal.
     """
     scenario = truth.log.scenario
     path, building = scenario.poses[:, :2], scenario.building
-    passed, crossed = doors_of(building).passed(path), crossings_of(building).passed(path)
-    changes = _changes(truth, hybrid_map)
-    portals = _portals(truth, hybrid_map, scans, configuration)
-    to_changes = np.concatenate((passed.apart(changes), crossed.apart(changes)))
+    passed, crossed = doors_of(building).select_passed(path), crossings_of(building).select_passed(path)
+    changes = _area_changes(truth, hybrid_map)
+    portals = _portal_places(truth, hybrid_map, scans, configuration)
+    to_changes = np.concatenate((passed.distances(changes), crossed.distances(changes)))
     return {
         "areas": len(hybrid_map.area_ids()),
         "changes": to_changes.min(axis=0, initial=math.inf).tolist(),
-        "doors": passed.apart(changes).min(axis=1, initial=math.inf).tolist(),
-        "crossings": crossed.apart(changes).min(axis=1, initial=math.inf).tolist(),
-        "portals": [_from_gap(truth, place, configuration) for place in portals],
-        "doors_portals": passed.apart(portals).min(axis=1, initial=math.inf).tolist(),
+        "doors": passed.distances(changes).min(axis=1, initial=math.inf).tolist(),
+        "crossings": crossed.distances(changes).min(axis=1, initial=math.inf).tolist(),
+        "portals": [_distance_from_gap(truth, place, configuration) for place in portals],
+        "doors_portals": passed.distances(portals).min(axis=1, initial=math.inf).tolist(),
     }
 
 
-def _changes(truth: Truth, hybrid_map: HybridMap) -> Array:
+def _area_changes(truth: Truth, hybrid_map: HybridMap) -> Array:
     """True places (n, 2) where the path goes from one area into another, each between two keyframes."""
     path = sorted((k, area) for area in hybrid_map.area_ids() for k in hybrid_map.keyframes(area))
     ends = [(truth.poses[a][:2], truth.poses[b][:2]) for (a, left), (b, entered) in pairwise(path) if left != entered]
     return np.array([0.5 * (a + b) for a, b in ends if np.hypot(*(a - b)) <= MAX_STEP]).reshape(-1, 2)
 
 
-def _portals(truth: Truth, hybrid_map: HybridMap, scans: Mapping[int, Scan], configuration: Configuration) -> Array:
+def _portal_places(
+    truth: Truth, hybrid_map: HybridMap, scans: Mapping[int, Scan], configuration: Configuration
+) -> Array:
     """Places (n, 2) of the portals in the world, by the true frame of the area that they are told in."""
     known, landmarks = AreaLandmarkExtractor(LocalMapping(configuration)), {}
     for area in hybrid_map.area_ids():
-        placed = hybrid_map.keyframes(area)
-        landmarks[area] = known.extract([scans[k] for k in placed], np.array(list(placed.values())).reshape(-1, 3))
+        poses = hybrid_map.keyframes(area)
+        landmarks[area] = known.extract([scans[k] for k in poses], np.array(list(poses.values())).reshape(-1, 3))
     portals = find_portals(hybrid_map, landmarks, configuration.features)
     frames = [truth.frame(hybrid_map, portal.areas[0]) for portal in portals]
-    poses = [se2.compose(frame, one.pose_in_a.mean) for frame, one in zip(frames, portals, strict=True)]
-    return np.array(poses).reshape(-1, 3)[:, :2]
+    portal_poses = [se2.compose(frame, one.pose_in_a.mean) for frame, one in zip(frames, portals, strict=True)]
+    return np.array(portal_poses).reshape(-1, 3)[:, :2]
 
 
-def _from_gap(truth: Truth, place: Array, configuration: Configuration) -> float:
+def _distance_from_gap(truth: Truth, place: Array, configuration: Configuration) -> float:
     """Distance of a place (2,) from the next gap that the walls have, as it shows from keyframes around, m."""
     least = math.inf
     for k, pose in truth.poses.items():
