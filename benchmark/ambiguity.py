@@ -1,4 +1,4 @@
-"""Hypotheses in identical places: probabilities until the evidence, and the outcome after it."""
+"""Hypotheses in identical places: their probabilities until the evidence, and the outcome after it."""
 
 from __future__ import annotations
 
@@ -26,44 +26,41 @@ SEEDS = 10
 _SHOWN = 15  # keyframe events before the question that are drawn, and after
 
 LOW, HIGH = 0.2, 0.8
-"""Between these probabilities a hypothesis is alive, and does not rule the other out."""
+"""Probabilities between which a hypothesis is alive and does not exclude the other."""
 
 SURE = 0.95
-"""The true hypothesis exceeds this after the evidence."""
+"""Probability that the true hypothesis has to exceed after the evidence."""
 
 SOON = 2.0
-"""Path within which it does, m: ``tlca.accept_distance``."""
+"""Path within which it has to, m: ``tlca.accept_distance``."""
 
 LATER = (SOON, 5.0, 10.0, 20.0)
-"""Paths after which it is told of how many re-entries the true hypothesis is sure, m."""
+"""Paths at which the table counts re-entries with a sure true hypothesis, m."""
 
 DECIDED = 0.99
-"""Odometry that says as much tells the places apart by itself."""
+"""Probability by odometry from which on it separates the places alone."""
 
 NEW, RIGHT, WRONG = "new ground", "the true place", "another place"
 _DPI = 80
 _COLORS = {RIGHT: "C0", WRONG: "C3", NEW: "C7"}
 
 POLICY = (
-    "A re-entry is the first keyframe event at which the robot, after new ground, is in a known place again that looks "
-    f"the same as another known one: a laser without noise sees the same from the robot's true pose and from its image "
-    f"in the other place, but for {100.0 * ALIKE_BEAMS:.0f} % of the beams or {ALIKE_VIEW:g} m, and an old keyframe is "
-    f"within {ALIKE_RADIUS:g} m of the image. *By odometry* is the probability of the true place among all that look "
-    "the same which follows from the readings since the robot last saw anything (in the ring, where it always does, "
-    "since it was there a lap ago), under the covariance that their errors truly have. Where that is "
-    f"{DECIDED:g} or more, odometry tells the places apart, and the evidence is there before the question; so it is in "
-    "the ring, all of whose sides look alike for ever, but a quarter turn is more than odometry ever errs by in a lap. "
-    "Elsewhere the evidence is the first keyframe at which the views differ. The question is the first event at which "
-    f"known places together have {LOW:g}. From it until the evidence, both the true and the other place should have "
-    f"between {LOW:g} and {HIGH:g} (and do not where there is no question before); {SOON:g} m after the evidence, or "
-    f"after the question if that comes later, the true one should have more than {SURE:g}. New ground and what is not "
-    f"examined have the rest. An inference that weighs odometry rightly stays between {LOW:g} and {HIGH:g} only where "
-    "odometry alone does."
+    "A re-entry is the first keyframe event at which the robot, after new ground, is in a known place that looks like "
+    "another known one. Two places look the same if a laser without noise sees the same from the robot's true pose and "
+    f"from its image in the other place, up to {100.0 * ALIKE_BEAMS:.0f} % of the beams or {ALIKE_VIEW:g} m, and an "
+    f"old keyframe is within {ALIKE_RADIUS:g} m of the image. *By odometry* is the probability of the true place among "
+    "all of these, by the odometry since the robot last saw anything, under the true covariance of its errors. In the "
+    "ring, where the robot always sees something, it is the odometry since it was there a lap ago. A value of "
+    f"{DECIDED:g} or more means that odometry separates the places before the question. Otherwise the evidence is the "
+    "first keyframe at which the views differ. The question is the first event at which known places together have "
+    f"{LOW:g}. From it until the evidence, both the true and the other place should have between {LOW:g} and {HIGH:g}. "
+    f"{SOON:g} m after the evidence, or after the question if that comes later, the true one should have more than "
+    f"{SURE:g}. New ground and unexamined answers have the rest."
 )
 
 
 class Reentry(NamedTuple):
-    """A re-entry, and how the hypotheses fared."""
+    """A re-entry, with the hypotheses over time and the verdict on them."""
 
     record: Record
     rivalry: Record
@@ -72,18 +69,18 @@ class Reentry(NamedTuple):
 
 
 def measure_ambiguity(settings: Settings) -> Report:
-    """Map the worlds, and the bundled log, and follow the hypotheses."""
+    """Map the worlds and the bundled log, and score the hypotheses at re-entries."""
     records = make_records(settings, WORLDS, SEEDS)
     found = [_judge_rivalry(record, rivalry) for record in records for rivalry in record["rivalries"]]
     report = Report("ambiguity", "Identical places", seeds=chosen_seeds(settings, SEEDS))
     for family in dict.fromkeys(record["family"] for record in records):
         report.requirements += requirements(family, [entry for entry in found if entry.record["family"] == family])
-    report.body += [reentry_table(found), _by_odometry(found), settling_table(found), POLICY]
+    report.body += [reentry_table(found), _by_odometry(found), decision_table(found), POLICY]
     report.data["reentries"] = [
         {"world": e.record["world"], **e.rivalry, **vars(e.verdict), "decided": is_decided(e.rivalry)} for e in found
     ]
     panels = _choose_panels(found) | _bundled_panel(settings)
-    caption = "ESS of the best hypothesis's particles, and the probabilities of where the robot is, over time."
+    caption = "Effective sample size of the best hypothesis, and probabilities of the robot's place, over time."
     report.pictures["ambiguity.png"] = caption
     report.illustrations = ("ambiguity.png",)
     particles = load_configuration(PARAMETERS, list(settings.changes)).filter.particles
@@ -97,23 +94,23 @@ def _judge_rivalry(record: Record, rivalry: Record) -> Reentry:
 
 
 def _evidence_event(rivalry: Record) -> int:
-    """The keyframe event from which on the places can be told apart."""
+    """The keyframe event from which on the places can be separated."""
     event: int = rivalry["event"] if is_decided(rivalry) or rivalry["evidence"] is None else rivalry["evidence"]
     return event
 
 
 def is_decided(rivalry: Record) -> bool:
-    """Whether odometry tells the places apart."""
+    """Whether odometry alone separates the places."""
     return bool(max(rivalry["by_odometry"], 1.0 - rivalry["by_odometry"]) >= DECIDED)
 
 
 def requirements(family: str, found: Sequence[Reentry]) -> list[Requirement]:
-    """What is asked for of the re-entries of a family."""
+    """Requirements on the re-entries of a family."""
     open_reentries, deciding = undecided(found), requiring_decision(found)
     alive_count = sum(entry.verdict.both_alive for entry in open_reentries)
     decided_count = sum(entry.verdict.is_decided_correctly for entry in deciding)
     count, total = len(open_reentries), f"of {len(deciding)}"
-    # Of none, all are alive: that would say nothing.
+    # A requirement on no re-entries would always be met.
     alive_requirements = [
         Requirement(f"{family}: of these {count}, both alive until the evidence", alive_count, math.inf, least=count)
     ]
@@ -127,52 +124,61 @@ def requirements(family: str, found: Sequence[Reentry]) -> list[Requirement]:
 
 
 def decided_by_odometry(found: Sequence[Reentry]) -> list[Reentry]:
-    """Those that odometry alone decides."""
+    """The re-entries that odometry alone decides."""
     return [entry for entry in found if is_decided(entry.rivalry)]
 
 
 def undecided(found: Sequence[Reentry]) -> list[Reentry]:
-    """Those that odometry alone does not decide."""
+    """The re-entries that odometry alone does not decide."""
     return [entry for entry in found if not is_decided(entry.rivalry)]
 
 
 def requiring_decision(found: Sequence[Reentry]) -> list[Reentry]:
-    """Those in which the true place has to become sure."""
-    return [entry for entry in found if entry.verdict.asked or not is_decided(entry.rivalry)]
+    """The re-entries in which the true place has to become sure."""
+    return [entry for entry in found if entry.verdict.has_question or not is_decided(entry.rivalry)]
 
 
-def settling_table(found: Sequence[Reentry]) -> str:
-    """Of how many re-entries the true place is sure, and stays so, after how much path."""
+def decision_table(found: Sequence[Reentry]) -> str:
+    """Number of re-entries whose true place is sure, and stays so, by the path after the evidence."""
     rows = []
-    for family in dict.fromkeys(entry.record["family"] for entry in found):
-        own = requiring_decision([entry for entry in found if entry.record["family"] == family])
-        for kind, chosen in (("decided by odometry", decided_by_odometry(own)), ("not decided by it", undecided(own))):
-            sure = [
-                sum(judge_reentry(e.moments, _evidence_event(e.rivalry), way).is_decided_correctly for e in chosen)
-                for way in LATER
+    for family, own in _by_family(found).items():
+        deciding = requiring_decision(own)
+        for kind, entries in (
+            ("decided by odometry", decided_by_odometry(deciding)),
+            ("not decided by it", undecided(deciding)),
+        ):
+            counts = [
+                sum(judge_reentry(e.moments, _evidence_event(e.rivalry), path).is_decided_correctly for e in entries)
+                for path in LATER
             ]
-            rows.append([f"{family}, {kind}", str(len(chosen)), *map(str, sure)])
-    return table(["re-entries", "number", *(f"sure {way:g} m after the evidence" for way in LATER)], rows)
+            rows.append([f"{family}, {kind}", str(len(entries)), *map(str, counts)])
+    return table(["re-entries", "number", *(f"sure {path:g} m after the evidence" for path in LATER)], rows)
 
 
 def reentry_table(found: Sequence[Reentry]) -> str:
-    """One line for every re-entry that odometry does not decide, and one for all others of a family."""
-    head = ["re-entry in", "path since it knew where it was [m]", "by odometry", "evidence after [m]"]
-    head += ["true one when asked", "before the evidence", "either, lowest", "highest", "alive", "sure after [m]"]
+    """A line for every re-entry that odometry does not decide, and one for all others of a family."""
+    head = ["re-entry in", "path since the last certain pose [m]", "by odometry", "evidence after [m]"]
+    head += ["true one at the question", "before the evidence", "either, lowest", "highest", "alive", "sure after [m]"]
     head += [f"true one after {SOON:g} m", "sure"]
     rows = [_reentry_row(entry) for entry in undecided(found)]
-    for family in dict.fromkeys(entry.record["family"] for entry in found):
-        own = [e for e in found if e.record["family"] == family and is_decided(e.rivalry) and e.verdict.asked]
-        least = min((e.rivalry["by_odometry"] for e in own), default=math.nan)
-        sure = f"{sum(e.verdict.is_decided_correctly for e in own)} of {len(own)}"
-        final = min((e.verdict.final for e in own), default=math.nan)
+    for family, own in _by_family(found).items():
+        entries = [entry for entry in decided_by_odometry(own) if entry.verdict.has_question]
+        least = min((entry.rivalry["by_odometry"] for entry in entries), default=math.nan)
+        correct = f"{sum(entry.verdict.is_decided_correctly for entry in entries)} of {len(entries)}"
+        final = min((entry.verdict.final for entry in entries), default=math.nan)
         name = f"{family}, decided by odometry"
-        rows.append([name, "", f"at least {least:.4f}", *[""] * 7, f"at least {final:.3f}", sure])
+        rows.append([name, "", f"at least {least:.4f}", *[""] * 7, f"at least {final:.3f}", correct])
     return table(head, rows)
 
 
+def _by_family(found: Sequence[Reentry]) -> dict[str, list[Reentry]]:
+    """The re-entries of each family, in the order of their first ones."""
+    families = dict.fromkeys(entry.record["family"] for entry in found)
+    return {family: [entry for entry in found if entry.record["family"] == family] for family in families}
+
+
 def _by_odometry(found: Sequence[Reentry]) -> str:
-    """How many of the re-entries odometry alone leaves as open as is asked for."""
+    """A sentence with the number of re-entries that odometry alone leaves undecided."""
     open_reentries = undecided(found)
     undecided_count = sum(LOW <= entry.rivalry["by_odometry"] <= HIGH for entry in open_reentries)
     return (
@@ -189,42 +195,40 @@ def _reentry_row(entry: Reentry) -> list[str]:
         entry.record["world"],
         f"{distances[rivalry['event']] - distances[rivalry['since']]:.0f}",
         f"{rivalry['by_odometry']:.3f}",
-        format_figure(to_evidence, 1),
+        _format_figure(to_evidence, 1),
         *(
-            format_figure(value, 3)
+            _format_figure(value, 3)
             for value in (verdict.at_question, verdict.at_evidence, verdict.lowest, verdict.highest)
         ),
-        format_verdict(verdict.both_alive),
-        format_figure(verdict.waited, 1),
-        format_figure(verdict.final, 3),
-        format_verdict(verdict.is_decided_correctly),
+        _format_verdict(verdict.both_alive),
+        _format_figure(verdict.waited, 1),
+        _format_figure(verdict.final, 3),
+        _format_verdict(verdict.is_decided_correctly),
     ]
 
 
-def format_figure(value: float | None, digits: int) -> str:
+def _format_figure(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def format_verdict(met: bool) -> str:
+def _format_verdict(met: bool) -> str:
     return "pass" if met else "FAIL"
 
 
 def _choose_panels(found: Sequence[Reentry]) -> dict[str, Panel]:
-    """One re-entry of each family: the first that odometry does not decide, else the first that was asked about."""
+    """One re-entry of each family: the first that odometry does not decide, else the first with a question."""
     panels = {}
-    for family in dict.fromkeys(entry.record["family"] for entry in found):
-        own = [entry for entry in found if entry.record["family"] == family and entry.verdict.asked]
-        if own:
-            entry = (undecided(own) or own)[0]
-            marks = {"in the known place again": entry.rivalry["event"]}
-            if entry.rivalry["evidence"] is not None:
-                marks["evidence"] = entry.rivalry["evidence"]
-            panels[entry.record["world"]] = _cut_panel(entry.record["pmf"], entry.moments, marks)
+    for own in _by_family([entry for entry in found if entry.verdict.has_question]).values():
+        entry = (undecided(own) or own)[0]
+        marks = {"in the known place again": entry.rivalry["event"]}
+        if entry.rivalry["evidence"] is not None:
+            marks["evidence"] = entry.rivalry["evidence"]
+        panels[entry.record["world"]] = _cut_panel(entry.record["pmf"], entry.moments, marks)
     return panels
 
 
 def _cut_panel(pmf: Sequence[Record], moments: Sequence[Moment], marks: dict[str, int]) -> Panel:
-    question = next(moment.event for moment in moments if moment.asked)
+    question = next(moment.event for moment in moments if moment.has_question)
     begin, end = min(question, *marks.values()) - _SHOWN, max(question, *marks.values()) + _SHOWN
     seconds = {moment.event: moment.seconds for moment in trace_hypotheses(pmf, 0)}
     shown = [moment for moment in trace_hypotheses(pmf, begin) if moment.event <= end]
@@ -232,23 +236,23 @@ def _cut_panel(pmf: Sequence[Record], moments: Sequence[Moment], marks: dict[str
 
 
 def _bundled_panel(settings: Settings) -> dict[str, Panel]:
-    """The first loop of the bundled log; where a hypothesis closes none, nothing is drawn."""
+    """The panel of the first loop of the bundled log; none if no hypothesis closes one."""
     with open_logs([BUNDLED]) as (log,):
         recorder = run_log(open_log(log.path), load_configuration(PARAMETERS, list(settings.changes))).recorder
     pmf = trace_of_recorder(recorder)
     moments = trace_hypotheses(pmf, 0)
-    questions = [moment.event for moment in moments if moment.asked]
+    questions = [moment.event for moment in moments if moment.has_question]
     return {f"{BUNDLED}, the bundled log": _cut_panel(pmf, moments, {"loop closed": questions[0]})} if questions else {}
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A keyframe event.
+    """The hypotheses at a keyframe event.
 
     :ivar seconds: since the first one.
     :ivar traveled: path length since the start, m.
     :ivar samples: effective sample size of the most probable hypothesis's particles.
-    :ivar probabilities: {``NEW``, ``RIGHT`` or ``WRONG``: of the hypotheses that say so}.
+    :ivar probabilities: {``NEW``, ``RIGHT`` or ``WRONG``: of the hypotheses of that class}.
     """
 
     event: int
@@ -258,17 +262,17 @@ class Moment:
     probabilities: dict[str, float]
 
     @property
-    def asked(self) -> bool:
-        """Whether it may be that the robot is in a known place."""
+    def has_question(self) -> bool:
+        """Whether known places together have the probability ``LOW``."""
         return self.probabilities[RIGHT] + self.probabilities[WRONG] >= LOW
 
 
 def trace_hypotheses(pmf: Sequence[Mapping[str, Any]], begin: int) -> list[Moment]:
-    """All that follows from a keyframe event on.
+    """The moments from a keyframe event on.
 
-    A hypothesis is in new ground until it closes a loop; from the first closure on that is not true, it is wrong.
+    A hypothesis is in new ground until it closes a loop; it is wrong from its first false closure on.
 
-    :param pmf: as :class:`benchmark.simulated.watch.Watch` keeps it.
+    :param pmf: as of :class:`benchmark.simulated.watch.Watch`.
     """
     kinds: dict[int, str] = {}
     moments = []
@@ -298,11 +302,11 @@ def _classify(before: str, hypothesis: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the hypotheses fared as they should.
+    """The verdict on the hypotheses of a re-entry.
 
-    :ivar asked: whether it ever may be that the robot is in a known place: with probability ``LOW``.
+    :ivar has_question: whether known places together ever have the probability ``LOW``.
     :ivar lowest: the smallest probability of the true and of another place, from the question to the evidence.
-    :ivar highest: the largest of the two; both None where nothing was asked before the evidence.
+    :ivar highest: the largest of the two; both None without a question before the evidence.
     :ivar at_question: probability of the true place at the question; ``at_evidence``, just before the evidence; None
         likewise.
     :ivar waited: path from the evidence, or the question if that comes later, until the true one is sure, m; None where
@@ -310,7 +314,7 @@ class Verdict:
     :ivar final: probability of the true place ``SOON`` after the evidence, or the question.
     """
 
-    asked: bool
+    has_question: bool
     lowest: float | None
     highest: float | None
     at_question: float | None
@@ -320,22 +324,22 @@ class Verdict:
 
     @property
     def both_alive(self) -> bool:
-        """Whether both are from the question to the evidence."""
+        """Whether both places are alive from the question to the evidence."""
         return self.lowest is not None and self.highest is not None and self.lowest >= LOW and self.highest <= HIGH
 
     @property
     def is_decided_correctly(self) -> bool:
-        """Whether the true one is sure soon after the evidence, and stays so."""
+        """Whether the true place is sure soon after the evidence, and stays so."""
         return self.waited is not None and self.final > SURE
 
 
 def judge_reentry(moments: Sequence[Moment], evidence: int, soon: float = SOON) -> Verdict:
-    """Judge a story.
+    """The verdict on the moments of a re-entry.
 
-    :param evidence: the keyframe event from which on the places can be told apart.
-    :param soon: path within which the true one is to be sure, m.
+    :param evidence: the keyframe event from which on the places can be separated.
+    :param soon: path within which the true place has to be sure, m.
     """
-    question = next((moment for moment in moments if moment.asked), None)
+    question = next((moment for moment in moments if moment.has_question), None)
     if question is None:
         return Verdict(False, None, None, None, None, None, 0.0)
     open_moments = [moment for moment in moments if question.event <= moment.event < evidence]
@@ -355,7 +359,7 @@ def judge_reentry(moments: Sequence[Moment], evidence: int, soon: float = SOON) 
 
 
 def trace_of_recorder(recorder: Recorder) -> list[dict[str, Any]]:
-    """The PMF of a run of a real log, where every closure that a hypothesis makes is taken for right."""
+    """The PMF of a run of a real log, as of ``Watch``; all closures count as right."""
     entries = []
     for event, message in sorted(recorder.hypotheses.items()):
         keyframe = recorder.keyframes[event]
@@ -381,9 +385,9 @@ def _count_true(flags: Iterable[bool]) -> int:
 
 
 class Panel(NamedTuple):
-    """A story to be drawn.
+    """Moments to be drawn.
 
-    :ivar marks: {what happened: seconds}.
+    :ivar marks: {name of a moment: seconds}.
     """
 
     moments: Sequence[Moment]
@@ -391,9 +395,9 @@ class Panel(NamedTuple):
 
 
 def plot_ambiguity(path: Path, panels: Mapping[str, Panel], particles: int) -> None:
-    """ESS and the PMF of where the robot is over time; as Fig. 10 of the paper.
+    """Draw effective sample size and PMF of the robot's place over time, as Fig. 10 of the paper.
 
-    :param panels: {log: its story}.
+    :param panels: {log: panel}.
     :param particles: of a hypothesis.
     """
     figure = Figure(figsize=(4.5 * len(panels), 5.0), layout="constrained")

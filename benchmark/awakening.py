@@ -1,4 +1,4 @@
-"""Global localization in a saved map: distance until the robot is localized, and correctness."""
+"""Robot awakening [B]: global localization in a saved map, by distance and correctness."""
 
 from __future__ import annotations
 
@@ -38,26 +38,26 @@ from hmt_slam_ros.sensors import Scan
 LOGS = ("aces", "intel")
 WORLDS = ("office", "nested", "grid")
 ALIKE = ("grid",)
-"""Worlds whose every place exists several times, so that where it is cannot be known."""
+"""Worlds in which every place exists several times, so that the pose is ambiguous."""
 
 KINDS = ("whole", "first half")
-"""The maps of a log in which the robot wakes up."""
+"""The maps of a log in which the robot starts."""
 
 STARTS = 100
-"""Places of every log at which the robot wakes up."""
+"""Starts in every log."""
 
 FAR = 20.0
-"""m of travel within which the place is to be known."""
+"""Path within which the robot has to be localized, m."""
 
 SURE = 0.9
 RIGHT_SHARE = 0.95
 
 _RIGHT, _RIGHT_ANGLE = 1.0, math.radians(20.0)
-# m that the robot drives on once it knows its place; steps in which travel is counted, so that noise does not.
+# m that the robot drives on once it is localized; smallest step that counts as travel, m, against noise.
 _ON, _STEP = 5.0, 0.1
-# The log's last part is left out: a drive that ends says nothing of 20 m.
+# Last part of the log that is left out, because the drive ends before 20 m.
 _LAST = 0.05
-# A map holds a place where one of its keyframes was taken so near, m, and a start that much of the way from there, m.
+# Largest distance of a keyframe to a place that a map contains, m, and path from a start that has to be contained, m.
 _HELD, _HELD_WAY = 2.0, 10.0
 _DRAWS = 2008
 
@@ -77,12 +77,12 @@ POLICY = (
 
 @dataclass(frozen=True)
 class Awakening:
-    """What came of one start.
+    """The outcome of one start.
 
     :ivar start: number of the record.
-    :ivar found: m of travel until the robot said that it knows its place; inf where it never did.
-    :ivar right: whether it was right at the end of the travel.
-    :ivar wrong: whether it was sure of a wrong place at any time.
+    :ivar found: path until the robot was localized, m; inf if it never was.
+    :ivar right: whether its pose was right at the end of the path.
+    :ivar wrong: whether it was localized at a wrong place at any time.
     """
 
     start: int
@@ -92,20 +92,20 @@ class Awakening:
 
     @property
     def good(self) -> bool:
-        """Whether it was right in time."""
+        """Whether the robot was localized in time, and never wrongly."""
         return self.right and not self.wrong and self.found <= FAR
 
 
 @dataclass(frozen=True, eq=False)
 class MappedLog:
-    """A saved map, and what is known of a drive through it.
+    """A saved map, and a drive through it with its truth.
 
     :ivar configuration: of the runs.
     :ivar records: of the log.
-    :ivar state: what was saved.
+    :ivar state: the saved map.
     :ivar scans: shape (n,), numbers of the records that are scans.
     :ivar truth: shape (n, 3), ``map_T_base`` of these.
-    :ivar starts: numbers of scans at which the robot may wake up.
+    :ivar starts: numbers of scans at which the robot may start.
     """
 
     configuration: Configuration
@@ -117,8 +117,8 @@ class MappedLog:
 
 
 def measure_awakening(settings: Settings) -> Report:
-    """Map the logs, and wake up in them."""
-    report = Report("awakening", "Waking up in a saved map", seeds=(0,))
+    """Map the logs, and localize the robot from starts in them."""
+    report = Report("awakening", "Global localization in a saved map", seeds=(0,))
     configuration = load_configuration(PARAMETERS, list(settings.changes))
     names = settings.logs_or((*LOGS, *WORLDS))
     rows = []
@@ -144,9 +144,9 @@ def measure_awakening(settings: Settings) -> Report:
 def complete_starts(
     name: str, path: Path | str, configuration: Configuration, changes: Sequence[str], count: int, records: Records
 ) -> dict[str, list[Awakening]]:
-    """The first starts in each map of a log, of which those are made that are not there.
+    """The first starts in each map of a log; missing ones are made.
 
-    :param changes: by which the configuration differs from the file.
+    :param changes: parameters of the configuration that differ from the file.
     """
     file = StartsFile(records.folder / f"awakening-{name}-{_fingerprint(changes)}.json")
     file.complete(path, configuration, count, records.jobs)
@@ -154,9 +154,9 @@ def complete_starts(
 
 
 def requirements(name: str, found: Sequence[Awakening], *, is_distinguishable: bool) -> list[Requirement]:
-    """What is asked for of the starts in one map.
+    """Requirements on the starts in one map.
 
-    :param is_distinguishable: whether the places can be told apart.
+    :param is_distinguishable: whether the places differ.
     """
     wrong = Requirement(f"{name}: confident wrong answers", sum(start.wrong for start in found), 0)
     share = float(np.mean([start.good for start in found]))
@@ -165,7 +165,7 @@ def requirements(name: str, found: Sequence[Awakening], *, is_distinguishable: b
 
 
 def map_log(path: Path | str, configuration: Configuration) -> dict[str, MappedLog]:
-    """The maps of a whole log and of its first half, {how it is called: that}."""
+    """The maps of a whole log and of its first half, {kind: map}."""
     records = list(open_log(path).records())
     scans = np.array([n for n, record in enumerate(records) if isinstance(record.measurement, Scan)])
     middle, last = len(scans) // 2, int((1.0 - _LAST) * len(scans))
@@ -206,7 +206,7 @@ def _keyframes(state: RunState) -> dict[int, Float64]:
 
 
 def path_lengths(poses: Float64) -> Iterator[float]:
-    """Length of the path up to each pose, shape (n, 3), m."""
+    """Path length up to each of the poses (n, 3), m."""
     total, last = 0.0, poses[0]
     for pose in poses:
         step = math.hypot(*(pose - last)[:2])
@@ -216,9 +216,9 @@ def path_lengths(poses: Float64) -> Iterator[float]:
 
 
 class StartsFile:
-    """The starts of a log that were made, in a file, so that a measurement that was stopped goes on from there.
+    """The file of the starts of a log, from which an interrupted measurement continues.
 
-    :ivar file: of lines, each with a start and the map in which it was.
+    :ivar file: with a line for each start: the kind of its map and the fields of :class:`Awakening`.
     """
 
     def __init__(self, file: Path) -> None:
@@ -231,7 +231,7 @@ class StartsFile:
         return {kind: [Awakening(*row[1:]) for row in rows if row[0] == kind][:count] for kind in KINDS}
 
     def complete(self, path: Path | str, configuration: Configuration, count: int, jobs: int) -> None:
-        """Make the starts that are not there of the first ``count`` in each map."""
+        """Make the missing ones of the first ``count`` starts in each map."""
         made = {kind: len(start) for kind, start in self.starts(count).items()}
         if min(made.values()) >= count:
             return
@@ -239,7 +239,7 @@ class StartsFile:
         for kind, log in map_log(path, configuration).items():
             drawn = np.random.default_rng(_DRAWS).integers(0, max(1, len(log.starts)), count).tolist()
             starts = [log.starts[n] for n in drawn if log.starts]
-            # Forked with the map, so that none has to load it.
+            # Forked processes share the map.
             with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork"), _set_log, (log,)) as pool:
                 for start in pool.map(_try_start, starts[made[kind] :]):
                     with self.file.open("a", encoding="utf-8") as target:
@@ -247,7 +247,7 @@ class StartsFile:
 
 
 def _fingerprint(changes: Sequence[str]) -> str:
-    """What the starts of this code, with parameters that differ, are known by."""
+    """A hash of this code and the changed parameters, which names the file of the starts."""
     own = hashlib.sha256("\n".join([code_hash(), *changes]).encode() + Path(__file__).read_bytes())
     return own.hexdigest()[:16]
 
@@ -264,7 +264,7 @@ def _try_start(start: int) -> Awakening:
 
 
 def try_start(log: MappedLog, start: int) -> Awakening:
-    """Wake up at a scan of a drive, and go on from there."""
+    """Localize the robot globally at a scan of a drive and the scans after it."""
     run = LockStepRun(log.configuration, state=log.state)
     run.lock_step.feed(PoseReset())
     found, right, wrong = math.inf, False, False
@@ -288,7 +288,7 @@ def try_start(log: MappedLog, start: int) -> Awakening:
 
 
 def _is_localized(run: LockStepRun) -> bool:
-    """Whether the robot is sure of its place."""
+    """Whether hypotheses that are not lost have the probability ``SURE``."""
     hypotheses = run.recorder.hypotheses
     if not hypotheses:
         return False
@@ -299,9 +299,9 @@ def _is_localized(run: LockStepRun) -> bool:
 
 
 def _is_right(run: LockStepRun, before: Sequence[AreaPose], true: Float64) -> bool | None:
-    """Whether the last estimate is near the truth; None where its area became part of another since.
+    """Whether the last estimate is near the truth; None if its area was merged with another since.
 
-    :param before: where the areas of the map were.
+    :param before: poses of the areas in the saved map.
     :param true: ``map_T_base``, shape (3,).
     """
     slam, last = run.lock_step.processes["slam"], run.recorder.last_estimate
@@ -320,7 +320,7 @@ def _is_right(run: LockStepRun, before: Sequence[AreaPose], true: Float64) -> bo
 
 def _starts_row(name: str, kind: str, found: Sequence[Awakening]) -> list[str]:
     distances = [start.found for start in found if start.right]
-    share_text = f"{np.mean([start.good for start in found]):.2f}" if found else "-"
+    share = f"{np.mean([start.good for start in found]):.2f}" if found else "-"
     figures = (f"{statistic(distances):.1f}" if distances else "-" for statistic in (np.mean, np.median, max))
     wrong, never = sum(start.wrong for start in found), sum(math.isinf(start.found) for start in found)
-    return [name, kind, str(len(found)), share_text, *figures, str(wrong), str(never)]
+    return [name, kind, str(len(found)), share, *figures, str(wrong), str(never)]

@@ -1,4 +1,4 @@
-"""Random corridors with landmarks: a map of places, and the building that it is a map of."""
+"""Random corridors with landmarks: maps of places, and true buildings for them."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def random_corridors(random: np.random.Generator, rows: int, columns: int, densi
 
 
 def draw_building(random: np.random.Generator, corridors: Corridors) -> Corridors:
-    """A building that the corridors may be a map of: what stands there, and where exactly."""
+    """A random building of which the corridors are a map: the landmarks that exist, at exact places."""
     nodes = [
         Node(
             float(random.random() < node.existence), _draw_present(random, node.north), _draw_present(random, node.east)
@@ -85,7 +85,7 @@ def _draw_present(random: np.random.Generator, landmarks: LandmarkSequence) -> L
 
 
 def _crossings(random: np.random.Generator, count: int) -> Float64:
-    """Where hallways cross another one, between its two ends, which are the first and the last, m."""
+    """Positions of crossings along a hallway, with its two ends as first and last, m."""
     steps = [*random.uniform(*_END, 1), *random.uniform(*_BETWEEN, count - 1), *random.uniform(*_END, 1)]
     return np.concatenate(([0.0], np.cumsum(steps)))
 
@@ -137,7 +137,7 @@ def _opening(random: np.random.Generator, widths: tuple[float, float], tracks: S
 
 
 def _corners(random: np.random.Generator, length: float, density: float) -> LandmarkSequence:
-    """Corners along a stretch of hallway, which head for one of its four diagonals."""
+    """Random corners along a stretch of hallway, with headings along one of the four diagonals."""
     tracks, along, forms = [], [], []
     for track in range(_CORNER):
         at = 0.5 * _APART + random.exponential(1.0 / density)

@@ -12,7 +12,7 @@ from hmt_slam_ros.places.observation import ObservationModel, visible_interval
 from hmt_slam_ros.places.observation_graph import OPENINGS, TRACKS, LandmarkSequence, merge_sequences, select_landmarks
 
 SURENESS = 2.0
-"""Confidences p_l of all that is extracted are drawn from a beta distribution; the smaller this, the wider."""
+"""Sum of the parameters of the beta distribution of confidences p_l; smaller values are wider."""
 
 WIDTHS = (0.6, 3.0)
 """Of openings, m, evenly distributed."""
@@ -21,9 +21,9 @@ WIDTHS = (0.6, 3.0)
 def draw_observation(
     random: np.random.Generator, landmarks: LandmarkSequence, offset: float, variance: float, model: ObservationModel
 ) -> LandmarkSequence:
-    """What is seen of the landmarks of a state.
+    """A random observation of the landmarks of a state.
 
-    :param offset: how far the robot is beyond the state's node, m.
+    :param offset: of the robot beyond the state's node, m.
     :param variance: of that, m^2.
     """
     there = random.random(len(landmarks.tracks)) < landmarks.probabilities
@@ -33,7 +33,7 @@ def draw_observation(
 def draw_of_present(
     random: np.random.Generator, landmarks: LandmarkSequence, there: Bool, offset: float, model: ObservationModel
 ) -> LandmarkSequence:
-    """The same where it is known which landmarks are there, and where the robot is."""
+    """A random observation of the present landmarks from a known position."""
     extracted = there & (random.random(len(there)) < model.detection)
     extracted_landmarks = select_landmarks(landmarks, extracted)
     corner = extracted_landmarks.tracks < OPENINGS
@@ -64,7 +64,7 @@ def draw_of_present(
 def draw_clutter(
     random: np.random.Generator, present_density: float, absent_density: float, model: ObservationModel
 ) -> LandmarkSequence:
-    """Landmarks of no map, of two densities, 1/m: of those that are there, and those that are not."""
+    """Random landmarks outside of the map, by the densities of true and of false ones, 1/m."""
     lists = []
     for density, is_present in ((present_density, True), (absent_density, False)):
         count = int(random.poisson(density * 2.0 * model.reach * TRACKS))
@@ -76,11 +76,11 @@ def draw_clutter(
 
 
 def _draw_confidences(random: np.random.Generator, count: int, model: ObservationModel, there: bool = True) -> Float64:
-    """Confidences of landmarks that are there, or not: of all, they would be beta(a, b) with the mean pi."""
+    """Random confidences of true or false landmarks; those of all landmarks are beta(a, b) with the mean pi."""
     a, b = SURENESS * model.true_share, SURENESS * (1.0 - model.true_share)
     return random.beta(a + there, b + (not there), count)
 
 
 def _make_sequence(tracks: Int64, along: Float64, forms: Float64, confidences: Float64) -> LandmarkSequence:
-    """Landmarks whose places and forms were measured without more error than the model's own."""
+    """Landmarks whose positions and forms have only the errors of the model."""
     return merge_sequences((LandmarkSequence(tracks, along, forms, np.zeros((len(tracks), 2)), confidences),))

@@ -1,4 +1,4 @@
-"""Maps of changing worlds in mode lifelong: changed and kept surfaces, and traces of people."""
+"""Maps of changing worlds in mode lifelong: changed and kept surfaces, and ghosts of people."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmark.one_drive import JoinedVisits
-from benchmark.report import Report, Requirement, table
+from benchmark.report import Columns, Report, Requirement, mean, table_of
 from benchmark.settings import Settings
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
@@ -35,41 +35,39 @@ WORLDS = {"quiet": "office", "people": "busy"}
 """The same buildings without and with people in the corridors."""
 
 SEEDS, FIRST_SEED, RETURNS = 3, 1000, 3
-"""Buildings of each world, the first of them, and returns to one in which nothing changes."""
+"""Number of buildings of each world, seed of the first, and number of returns to one without changes."""
 
 SIZE, RATE = 0.7, 3.0
-"""Of the buildings, as a factor on lengths, and scans a second: a visit takes seconds then."""
+"""Factor on the lengths of the buildings, and scans per second."""
 
 RECALL, KEPT, GHOSTS, UNEXPLAINED, ERROR, GROWTH = 0.8, 0.98, 0.1, 0.002, 0.1, 0.05
-"""Least shares of what is new and of what stays, largest of what is gone and of what nothing explains, m, growth."""
+"""Smallest shares of new and remaining surfaces; largest shares of ghosts and unexplained cells, error (m), growth."""
 
 LOCALIZED = 0.1
-"""Mean error of poses in localization at most, m."""
+"""Largest mean error of poses in mode localization, m."""
 
 POLICY = (
-    "Every building is mapped at one visit, of two laps, and visited again in mode `lifelong`, from the saved map; "
-    "before each of the two visits, half of the furniture was moved and half of the doors that are not on the way were "
-    "closed, so that between them doors were opened too. Without people the robot is told about where it begins, as by "
-    "`initialpose`; with people it stayed where it was and turned round, since among people it is often not "
-    "recognized. A surface counts if three of every fourth scan of the second visit had a free view of it within 8 m. "
-    "New is what was 0.2 m and more from any surface of the "
-    "first visit; it is in the map where a cell within 0.1 m is occupied. Gone is what was in the map of the first "
-    "visit, is as far from any surface of the second one, and was in free view of as many scans: it is a ghost where a "
-    "cell within 0.1 m is still occupied. What was in the map of the first visit and still stands is kept where one "
-    "is. Cells that are 0.2 m from every true surface of the last visit are "
-    "unexplained, but for what is gone and could not be seen to be. Errors are those of the second visit's final "
-    f"trajectory in the map of the first. The growth is that of keyframes from the second to visit {RETURNS + 1} "
-    "of a building in which nothing changes. In `localization` every keyframe, pose, scan and arc has to be the same "
-    "bit for bit afterwards; its errors are those of poses by which nothing is mapped, where the robot was lost too."
+    "Every building is mapped at one visit, of two laps, and visited again in mode `lifelong`, from the saved map. "
+    "Before each of the two visits, half of the furniture was moved, and half of the doors off the route were closed, "
+    "so that doors are also opened between them. Without people, the robot gets an approximate initial pose; with "
+    "people, it stayed where it was and turned round. A surface counts if three of every fourth scan of the second "
+    "visit had a free view of it within 8 m. New surfaces were 0.2 m or more from any surface of the first visit; they "
+    "are in the map if a cell within 0.1 m is occupied. Surfaces that are gone were in the map of the first visit, are "
+    "as far from any surface of the second one, and were in free view of as many scans; each is a ghost if a cell "
+    "within 0.1 m is still occupied. Surfaces of the first map that remain are kept if such a cell is. Cells at 0.2 m "
+    "or more from every true surface of the last visit are unexplained, except for surfaces that were not seen to be "
+    "gone. Errors are those of the second visit's final trajectory in the map of the first. The growth is that of "
+    f"keyframes from the second to visit {RETURNS + 1} of a building in which nothing changes. In `localization` every "
+    "keyframe, pose, scan and arc has to be the same bit for bit afterwards; its errors include poses of a lost robot."
 )
 
-# As certain as a pose that is drawn in RViz.
-_POINTED_AT = np.diag([0.5, 0.5, np.radians(15.0)]) ** 2
+# Covariance of an initial pose that is drawn in RViz.
+_INITIAL_COVARIANCE = np.diag([0.5, 0.5, np.radians(15.0)]) ** 2
 
 Points = NDArray[np.float64]
 _SAMPLE = 0.05  # m, between points of a surface
-_REACH, _LOOKS = 8.0, 3  # m from which a surface is seen, and scans of the visit that have to see it
-_HELD = 0.1  # m from an occupied cell
+_REACH, _MIN_SCANS = 8.0, 3  # largest distance of a surface that is seen, m, and smallest number of scans that see it
+_NEAR = 0.1  # largest distance of a mapped surface from an occupied cell, m
 _APART = 0.2  # m between surfaces of two visits
 _SHORT = 0.02  # m, by which a line of sight ends before the surface
 _EVERY = 4  # of the scans
@@ -77,17 +75,17 @@ _EVERY = 4  # of the scans
 
 @dataclass(frozen=True)
 class Visit:
-    """What came of a building that was visited twice.
+    """The scores of a building that was visited twice.
 
-    :ivar new: share of the new surfaces that is in the map.
-    :ivar gone: share of those that are gone that still is.
-    :ivar kept: share of those that still stand that still is.
-    :ivar before: occupied cells that nothing explains after the first visit, as a share of all.
+    :ivar new: share of the new surfaces that are in the map.
+    :ivar gone: share of the surfaces that are gone, but still in the map.
+    :ivar kept: share of the remaining surfaces that are still in the map.
+    :ivar before: share of the occupied cells that are unexplained after the first visit.
     :ivar after: likewise after the second.
     :ivar error: of the second visit's poses, mean, m.
     :ivar worst: largest of them, m.
     :ivar keyframes: of the map after each of the two.
-    :ivar lengths: of new surface, and of surface that is gone, at 0.05 m each.
+    :ivar lengths: of new surfaces and of surfaces that are gone, m.
     """
 
     new: float
@@ -118,8 +116,8 @@ class LocalizationVisit(NamedTuple):
 class MapAfterVisit:
     """A building after a visit.
 
-    :ivar recording: the map at its best.
-    :ivar state: from which a run goes on.
+    :ivar recording: the refined map.
+    :ivar state: of the run.
     :ivar image: of the map.
     """
 
@@ -135,7 +133,7 @@ class MapAfterVisit:
 
 
 def measure_changes(settings: Settings) -> Report:
-    """Visit the buildings."""
+    """Visit the buildings, and score their maps."""
     seeds = tuple(FIRST_SEED + seed for seed in settings.seeds_or(SEEDS))
     report = Report("changes", "A world that changes", seeds=seeds)
     context = multiprocessing.get_context("spawn")
@@ -148,33 +146,24 @@ def measure_changes(settings: Settings) -> Report:
         sizes_of_world = sizes[name].result()
         report.requirements += requirements(name, found, sizes_of_world, localized[name])
         scores = [visit._asdict() for visit in localized[name]]
-        report.data[name] = {
-            "visits": [asdict(visit) for visit in found],
-            "keyframes": sizes_of_world,
-            "localization": scores,
-        }
-        rows += [_visit_row(f"{name}, {seed}", visit) for seed, visit in zip(seeds, found, strict=True)]
+        report.data[name] = {"visits": list(map(asdict, found)), "keyframes": sizes_of_world, "localization": scores}
+        rows += [(f"{name}, {seed}", visit) for seed, visit in zip(seeds, found, strict=True)]
         report.body.append(
             f"{name}, nothing changes: {', '.join(map(str, sizes_of_world))} keyframes after the visits."
         )
     report.body += [_describe_localization(name, seeds, scores) for name, scores in localized.items()]
-    head = ["world, seed", "new [m]", "in the map", "gone [m]", "ghosts", "kept", "unexplained before", "after"]
-    report.body = [table([*head, "error [m]", "worst [m]", "keyframes"], rows), *report.body, POLICY]
+    report.body = [table_of(_COLUMNS, rows), *report.body, POLICY]
     return report
 
 
 def requirements(
     name: str, found: Sequence[Visit], sizes: Sequence[int], localized: Sequence[LocalizationVisit]
 ) -> list[Requirement]:
-    """What is asked for of a world.
+    """Requirements on a world.
 
     :param sizes: keyframes after each visit in which nothing changed.
     :param localized: second visits in mode localization.
     """
-
-    def mean(values: Sequence[float]) -> float:
-        return float(np.mean(values))
-
     return [
         Requirement(f"{name}: new surfaces in the map", mean([visit.new for visit in found]), 1.0, least=RECALL),
         Requirement(f"{name}: surfaces that stay, kept", mean([visit.kept for visit in found]), 1.0, least=KEPT),
@@ -206,8 +195,8 @@ def visit_twice(world: str, seed: int, size: float = SIZE, rate: float = RATE) -
         scores.new,
         scores.gone,
         scores.kept,
-        unexplained_share(images[0], frames[0], surfaces[0].walls),
-        unexplained_share(images[1], frames[1], np.concatenate((surfaces[1].walls, scores.hidden))),
+        unexplainedmean(images[0], frames[0], surfaces[0].walls),
+        unexplainedmean(images[1], frames[1], np.concatenate((surfaces[1].walls, scores.hidden))),
         *_errors(second.recording, logs),
         (first.keyframes, second.keyframes),
         scores.lengths,
@@ -242,9 +231,9 @@ def _errors(recording: Recording, logs: Sequence[SimulatedLog]) -> tuple[float, 
 
 
 def map_visits(visits: Sequence[SimulatedLog], mode: str, before: MapAfterVisit | None = None) -> MapAfterVisit:
-    """The map after the last of some visits.
+    """Map the last of some visits.
 
-    :param before: after the one before it.
+    :param before: the map after the visit before.
     """
     stays = visits[0].scenario.settings.people > 0
     log: Log = JoinedVisits(visits) if stays else visits[-1]
@@ -266,17 +255,16 @@ def map_visits(visits: Sequence[SimulatedLog], mode: str, before: MapAfterVisit 
 
 
 def _initial_pose(recording: Recording) -> InitialPose:
-    """Where every visit begins, which is the origin of the map, as somebody says who points at it."""
+    """The initial pose of every visit, the origin of the map, with the accuracy of RViz."""
     placed = keyframe_poses(recording.hybrid_map, recording.area_poses)
     nearest = min(placed, key=lambda keyframe: float(np.hypot(*placed[keyframe][:2])))
     area = next(a for a in recording.hybrid_map.area_ids() if nearest in recording.hybrid_map.keyframes(a))
     pose = se2.inverse(recording.area_poses[area].mean)
-    return InitialPose(area, PoseGaussian(pose, _POINTED_AT))
+    return InitialPose(area, PoseGaussian(pose, _INITIAL_COVARIANCE))
 
 
 def _simulate_visit(world: str, seed: int, number: int, *, changed: float, size: float, rate: float) -> SimulatedLog:
-    # The first has two laps, so that its loop is closed; things are moved between visits alone, so that each has one
-    # truth.
+    # Two laps of the first visit close its loop. Furniture is moved between visits only, so that each has one truth.
     return open_simulated(
         f"sim:{world},seed={seed},laps={2 if number == 1 else 1},moved=0,visit={number},changed={changed:g},"
         f"size={size:g},rate={rate:g}"
@@ -293,7 +281,7 @@ def _frame(recording: Recording, first: SimulatedLog) -> NDArray[np.float64]:
 
 
 def _is_same_map(before: RunState, after: RunState) -> bool:
-    """Whether the best map of a state is in another one as it was."""
+    """Whether another state contains the best map of a state unchanged."""
     one, other = (Replica.from_state(state.processes["slam"].replica) for state in (before, after))
     old_map, new_map = one.maps[one.best_hypothesis], other.maps[other.best_hypothesis]
     areas = old_map.area_ids()
@@ -314,23 +302,23 @@ def _describe_localization(name: str, seeds: Sequence[int], localized: Sequence[
     return f"{name}, localization, error and worst [m]: {', '.join(texts)}."
 
 
-def _visit_row(name: str, visit: Visit) -> list[str]:
-    shares = [f"{100.0 * visit.gone:.0f} %", f"{100.0 * visit.kept:.1f} %"]
-    shares += [f"{100.0 * share:.2f} %" for share in (visit.before, visit.after)]
-    return [
-        name,
-        f"{visit.lengths[0]:.0f}",
-        f"{100.0 * visit.new:.0f} %",
-        f"{visit.lengths[1]:.0f}",
-        *shares,
-        f"{visit.error:.3f}",
-        f"{visit.worst:.3f}",
-        f"{visit.keyframes[0]}, {visit.keyframes[1]}",
-    ]
+_COLUMNS: Columns[tuple[str, Visit]] = [
+    ("world, seed", lambda row: row[0]),
+    ("new [m]", lambda row: f"{row[1].lengths[0]:.0f}"),
+    ("in the map", lambda row: f"{100.0 * row[1].new:.0f} %"),
+    ("gone [m]", lambda row: f"{row[1].lengths[1]:.0f}"),
+    ("ghosts", lambda row: f"{100.0 * row[1].gone:.0f} %"),
+    ("kept", lambda row: f"{100.0 * row[1].kept:.1f} %"),
+    ("unexplained before", lambda row: f"{100.0 * row[1].before:.2f} %"),
+    ("after", lambda row: f"{100.0 * row[1].after:.2f} %"),
+    ("error [m]", lambda row: f"{row[1].error:.3f}"),
+    ("worst [m]", lambda row: f"{row[1].worst:.3f}"),
+    ("keyframes", lambda row: ", ".join(map(str, row[1].keyframes))),
+]
 
 
 class Surfaces(NamedTuple):
-    """What stood in the building at a visit.
+    """The surfaces of a building at a visit, and the poses that saw them.
 
     :ivar walls: shape (n, 4), m, x and y of both ends: walls, closed doors and furniture.
     :ivar lasers: shape (k, 3), ``world_T_laser`` of some of the scans, m and rad.
@@ -343,7 +331,7 @@ class Surfaces(NamedTuple):
 
     @classmethod
     def of(cls, log: SimulatedLog) -> Surfaces:
-        """Of a visit during which nothing is moved."""
+        """The surfaces of a visit during which nothing is moved."""
         scenario = log.scenario
         poses = log.true_poses(scenario.scan_stamps[::_EVERY])
         walls = np.concatenate((scenario.walls.walls, furniture_walls(scenario.building.furniture)))
@@ -358,7 +346,7 @@ class Surfaces(NamedTuple):
         return np.concatenate(parts)
 
     def in_view(self, points: Points) -> NDArray[np.bool_]:
-        """Which points (m, 2) enough scans have a free line of sight to."""
+        """Which points (m, 2) have a free line of sight to enough scans, shape (m,)."""
         index, counts = wall_index(self.walls), np.zeros(len(points), dtype=np.int64)
         for laser in self.lasers:
             local = se2.transform(se2.inverse(laser), points)
@@ -368,17 +356,17 @@ class Surfaces(NamedTuple):
             directions = points[near] - laser[:2]
             ends = laser[:2] + directions * (1.0 - _SHORT / np.hypot(*directions.T))[:, None]
             counts[near] += has_line_of_sight(index, np.broadcast_to(laser[:2], ends.shape).copy(), ends)
-        return counts >= _LOOKS
+        return counts >= _MIN_SCANS
 
 
 class ChangeScores(NamedTuple):
-    """How a map follows a change.
+    """The scores of a map after a change.
 
-    :ivar new: share of the new surfaces that could be seen that is in the map.
-    :ivar gone: share of the surfaces in the map before that could be seen to be gone that still is.
-    :ivar kept: share of the surfaces in the map before that still stand where they did that is in the map after.
-    :ivar lengths: of the new ones and of those that could be seen to be gone.
-    :ivar hidden: shape (k, 4), the surfaces that are gone and could not be seen to be, as short pieces.
+    :ivar new: share of the visible new surfaces that are in the map.
+    :ivar gone: share of the surfaces that are visibly gone, but still in the map.
+    :ivar kept: share of the remaining surfaces of the first map that are in the second.
+    :ivar lengths: of visible new surfaces and of those that are visibly gone, m.
+    :ivar hidden: shape (k, 4), the surfaces that are gone without being seen, as short pieces, m.
     """
 
     new: float
@@ -391,7 +379,7 @@ class ChangeScores(NamedTuple):
 def score_changes(
     images: Sequence[OccupancyImage], frames: Sequence[Points], visits: Sequence[Surfaces]
 ) -> ChangeScores:
-    """How the second of two maps follows what changed between two visits.
+    """Score the second of two maps by the changes between their visits.
 
     :param frames: ``world_T_map`` of each, shape (3,).
     """
@@ -409,10 +397,10 @@ def score_changes(
         _is_occupied_near(images[1], frames[1], part) for part in (new, gone[is_seen_gone], remaining)
     )
     hidden = np.concatenate((gone[~is_seen_gone], gone[~is_seen_gone] + 1e-3), axis=1)
-    return ChangeScores(_share(found), _share(ghosts), _share(kept), lengths, hidden)
+    return ChangeScores(mean(found), mean(ghosts), mean(kept), lengths, hidden)
 
 
-def unexplained_share(image: OccupancyImage, frame: Points, walls: NDArray[np.float64]) -> float:
+def unexplainedmean(image: OccupancyImage, frame: Points, walls: NDArray[np.float64]) -> float:
     """Share of the occupied cells that are far from all surfaces.
 
     :param frame: ``world_T_map``, shape (3,).
@@ -421,17 +409,13 @@ def unexplained_share(image: OccupancyImage, frame: Points, walls: NDArray[np.fl
 
 
 def _occupied_cells(image: OccupancyImage, frame: Points) -> Points:
-    """The middles of the occupied cells, shape (n, 2), world frame."""
+    """The centers of the occupied cells, shape (n, 2), world frame, m."""
     row, column = np.nonzero(image.pixels[::-1] == OCCUPIED)
     cells = image.origin + image.resolution * (np.stack((column, row), axis=1) + 0.5)
     return np.ascontiguousarray(se2.transform(frame, cells))
 
 
 def _is_occupied_near(image: OccupancyImage, frame: Points, points: Points) -> NDArray[np.bool_]:
-    """Which points (n, 2), world frame, have an occupied cell beside them."""
+    """Which points (n, 2), world frame, have an occupied cell near them, shape (n,)."""
     cells = _occupied_cells(image, frame)
-    return np.asarray(clearance(np.concatenate((cells, cells), axis=1), points) <= _HELD, dtype=np.bool_)
-
-
-def _share(found: NDArray[np.bool_]) -> float:
-    return float(np.mean(found)) if len(found) else float("nan")
+    return np.asarray(clearance(np.concatenate((cells, cells), axis=1), points) <= _NEAR, dtype=np.bool_)

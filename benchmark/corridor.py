@@ -1,8 +1,7 @@
 """The filter in a bare corridor: ``python -m benchmark.corridor [--seeds N]``.
 
-Between two straight walls without ends the scans show nothing of how far the robot came. So the motion along the walls
-has to be that of the odometry, whose noise is here drawn as the motion model has it, and its covariance must cover the
-truth; it is what arcs are made of.
+Between two straight walls without ends, scans have no information along the walls. The motion along them is that of the
+odometry, whose noise is drawn from the motion model. The covariance, from which arcs are made, has to cover the truth.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from hmt_slam_ros.submap.particle_filter import ParticleFilter
 
 SEEDS = 24
 LEGS = {"a keyframe on": 1, "an arc, 20 keyframes on": 20}
-"""{what is compared: from a keyframe to the one so many later}."""
+"""{name of a motion: number of keyframes from its start to its end}."""
 
 _LENGTH, _STEP, _PERIOD = 30.0, 0.25, 250_000_000  # m of the drive, m and ns between scans
 _WEAVE = 0.05  # rad to each side by which the robot weaves
@@ -36,13 +35,13 @@ _COVERED = 3.841  # chi-square of 95 % in one dimension
 
 
 class Drive(NamedTuple):
-    """What the filter made of one drive.
+    """The estimates of the filter on one drive.
 
     :ivar truths: of the keyframes, x along the corridor, shape (k, 3).
     :ivar poses: as estimated, map frame, shape (k, 3).
-    :ivar covariances: what the step that led to each adds to the drift, in its own frame, shape (k, 3, 3).
+    :ivar covariances: of the step to each keyframe, in its own frame, shape (k, 3, 3).
     :ivar odometry_errors: of the odometry along the corridor from the start to each, shape (k,), m.
-    :ivar floor: deviations that every arc has at least, m and degrees.
+    :ivar floor: smallest deviations of an arc, m and degrees.
     """
 
     truths: NDArray[np.float64]
@@ -53,7 +52,7 @@ class Drive(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """Of some motions, along the corridor and across it.
+    """Errors of some motions, along the corridor and across it.
 
     :ivar errors: shape (n, 2), m.
     :ivar variances: stated, shape (n, 2), m^2.
@@ -68,7 +67,7 @@ class Errors(NamedTuple):
 
     @property
     def nees(self) -> NDArray[np.float64]:
-        """Normalised estimation error squared, 1 where the covariance is right, shape (2,)."""
+        """Normalized estimation error squared, 1 for a correct covariance, shape (2,)."""
         nees: NDArray[np.float64] = (self.errors**2 / self.variances).mean(axis=0)
         return nees
 
@@ -80,7 +79,7 @@ class Errors(NamedTuple):
 
     @property
     def shortening(self) -> tuple[float, float]:
-        """By how much the corridor comes out shorter than by odometry, as a share, and the deviation of that mean."""
+        """Share by which the corridor is shorter than by odometry, and the deviation of that mean."""
         shorter = (self.odometry_errors - self.errors[:, 0]) / self.lengths.mean()
         return float(shorter.mean()), float(shorter.std() / np.sqrt(shorter.size))
 
@@ -131,7 +130,7 @@ def _make_scan(stamp: int, pose: NDArray[np.float64], random: np.random.Generato
 
 
 def _process_scan(live: LiveHypothesis, motion: MotionModel, number: int, prepared_scan: PreparedScan) -> None:
-    """What metric SLAM does with a scan where no other process has anything to say."""
+    """Process a scan as metric SLAM does without the other processes."""
     prediction = motion.predict(prepared_scan.scan.stamp)
     if number:
         match = live.filter.track(prepared_scan, prediction)
@@ -142,7 +141,7 @@ def _process_scan(live: LiveHypothesis, motion: MotionModel, number: int, prepar
 
 
 def errors_of(drives: Sequence[Drive], stride: int) -> Errors:
-    """Of the motions from one keyframe to the one ``stride`` later, which do not overlap."""
+    """Errors of the disjoint motions from one keyframe to the one ``stride`` later."""
     rows = []
     for drive in drives:
         rows += [_motion_error(drive, first, first + stride) for first in range(0, len(drive.poses) - stride, stride)]
@@ -151,7 +150,7 @@ def errors_of(drives: Sequence[Drive], stride: int) -> Errors:
 
 
 def _motion_error(drive: Drive, first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
-    """Error (2,) and variance (2,) of a motion along and across the corridor, odometry's error and true length."""
+    """Error (2,) and variance (2,) of a motion along and across the corridor, error of odometry and true length."""
     sigma, angle = drive.floor
     covariance = np.zeros((3, 3))
     for k in range(first + 1, last + 1):
@@ -167,7 +166,7 @@ def _motion_error(drive: Drive, first: int, last: int) -> tuple[NDArray[np.float
 
 
 def report(drives: Sequence[Drive]) -> str:
-    """The table."""
+    """The table of errors."""
     head = ["motion", "number", "shrink [%]", "odometry [m]", "error [m]", "stated [m]", "NEES along", "across"]
     head += ["covered along [%]", "across"]
     rows = []
@@ -183,7 +182,7 @@ def report(drives: Sequence[Drive]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Drive once for every seed and print the table."""
+    """Drive once for every seed, and print the table."""
     parser = OneSentenceParser(prog="python -m benchmark.corridor", description="A bare corridor in the filter.")
     parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help="seeds 0 to N-1")
     seeds = parser.parse_args(arguments).seeds

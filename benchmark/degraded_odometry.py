@@ -4,17 +4,17 @@
 run is also the seed of what is drawn for the odometry.
 
 ==========  ==========================================================================================================
-kind        what is done to the odometry
+kind        degradation of the odometry
 ==========  ==========================================================================================================
 noise-2x    Gaussian noise on every increment, so that the error of the motion model's defaults grows twofold
 noise-4x    the same, fourfold
 slip        at random turns of more than 45 degrees, one in five, the heading slips by 20 degrees within a second
-missing     5 % of the readings, drawn at random, never came
-none        no reading ever came
+missing     5 % of the readings, drawn at random, are missing
+none        all readings are missing
 ==========  ==========================================================================================================
 
 The noise is a random walk: its variance grows with the distance and the angle traveled, whatever the rate of the
-readings, and over one metre or one radian the deviation is the motion model's. The same log, kind and seed give the
+readings, and over one meter or one radian the deviation is the motion model's. The same log, kind and seed give the
 same readings, bit for bit.
 """
 
@@ -77,7 +77,7 @@ class DegradedLog:
         return self.original.duration
 
     def records(self) -> Iterator[LogRecord]:
-        """All measurements in file order, with the odometry readings that are left."""
+        """All measurements in file order, with the remaining odometry readings."""
         index = 0
         for record in self.original.records():
             measurement = record.measurement

@@ -23,7 +23,7 @@ _SAME = 1e-6  # rad
 
 
 def heading_errors(world: World, laser: str, configuration: Configuration) -> NDArray[np.float64]:
-    """Along a drive: error of the filter, its deviation, error of the odometry, rad, and lines used, shape (n, 4)."""
+    """Error of the filter, its deviation, error of odometry (rad) and number of lines along a drive, shape (n, 4)."""
     scenario = open_simulated(",".join(filter(None, (world.log, laser)))).scenario
     features = replace(configuration.features, range_deviation=scenario.settings.range_noise)
     heading, count, readings = BuildingHeading(features), len(scenario.scan_stamps), scenario.settings.readings
@@ -46,7 +46,7 @@ def heading_errors(world: World, laser: str, configuration: Configuration) -> ND
 
 
 def _wall_direction(scenario: Scenario) -> float:
-    """Direction in which a building's walls run, up to quarters, rad; of its lines that of most."""
+    """Direction of most of the walls of a building, up to quarter turns, rad."""
     alphas = true_lines(scenario, int(scenario.scan_stamps[0]), np.zeros(3))[:, 0] % QUARTER_TURN
     apart = np.abs(alphas[:, None] - alphas[None, :])
     return float(alphas[np.argmax((np.minimum(apart, QUARTER_TURN - apart) < _SAME).sum(axis=1))])

@@ -1,9 +1,9 @@
-"""Byte-for-byte comparison of results with those on record in ``benchmark/identity.toml``.
+"""Byte-for-byte comparison of results with the digests in ``benchmark/identity.toml``.
 
 A change of layout, of names or of speed changes no bit of any result. A fixed set of runs has a digest each of its
 trajectories, probabilities, graph, closures and map; ``python -m benchmark identity`` compares them with the recorded
-ones, and ``--write-expected`` records them anew. Digests hold for one kind of processor and one version of each
-library, which stand in the file: elsewhere, record those of the older code first.
+ones, and ``--write-expected`` records new ones. Digests hold for one kind of processor and one version of each
+library, which are in the file: elsewhere, record those of the older code first.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ _EXPLORATION, _MISSION = 150.0, 120.0  # s, of the simulation
 
 @dataclass(frozen=True)
 class ReferenceRun:
-    """A run of the set.
+    """A run whose results have digests.
 
     :ivar log: the name of a recorded log, or ``sim:WORLD,...``.
     :ivar changes: parameters that differ from the file, as ``name=value``.
     :ivar duration: seconds of the log that are used, 0 for all.
-    :ivar source: name of the run whose map it goes on from, empty for none.
+    :ivar source: name of the run whose map it continues, empty for none.
     """
 
     log: str
@@ -74,18 +74,18 @@ RUNS = {
     "twins": ReferenceRun("sim:twins,seed=2"),
     "busy": ReferenceRun("sim:busy,seed=2"),
     "lines": ReferenceRun("sim:office,laps=1,seed=4", ("local_map.kind=lines",)),
-    "carried": ReferenceRun("sim:office,seed=3,carried=0.55,to=0.72,turned=30"),
+    "kidnapped": ReferenceRun("sim:office,seed=3,carried=0.55,to=0.72,turned=30"),
     "institute": ReferenceRun(f"{SIMULATION_PREFIX}{_INSTITUTE}"),
     "half": ReferenceRun("sim:office,seed=5", duration=100.0),
-    "gone on": ReferenceRun("sim:office,seed=5", source="half"),
-    "awakened": ReferenceRun("sim:office,seed=5,visit=1", source="half"),
+    "continued": ReferenceRun("sim:office,seed=5", source="half"),
+    "relocalized": ReferenceRun("sim:office,seed=5,visit=1", source="half"),
     "localization": ReferenceRun("sim:office,seed=2,visit=1", ("mode=localization",), source="office"),
     "lifelong": ReferenceRun("sim:busy,seed=2,visit=1", ("mode=lifelong",), source="busy"),
 }
-"""{name of a run: what is run}; runs whose maps others go on from stand before these."""
+"""{name of a run: run}; runs whose maps others continue are before these."""
 
 Digests = dict[str, str]
-"""{what of a run: its digest}."""
+"""{name of a result: its digest}."""
 
 
 def measure_identity(settings: Settings) -> Report:
@@ -109,7 +109,7 @@ def measure_identity(settings: Settings) -> Report:
 
 
 def differences(found: Mapping[str, Digests], expected: Mapping[str, Digests]) -> list[Requirement]:
-    """For each run, how many of its digests are not the recorded ones."""
+    """Requirements on the number of digests of each run that differ from the recorded ones."""
     return [
         Requirement(f"{run}: digests that differ", sum(expected.get(run, {}).get(what) != own[what] for what in own), 0)
         for run, own in found.items()
@@ -127,7 +127,7 @@ def _list_digests(found: Mapping[str, Digests]) -> Iterable[tuple[str, str, str]
 
 
 def _run_set(settings: Settings, report: Report) -> dict[str, Digests]:
-    """{run: digests} of all whose logs are there."""
+    """{run: digests} of all runs whose logs are there."""
     recorded = {run_of_set.log for run_of_set in RUNS.values() if not run_of_set.log.startswith(SIMULATION_PREFIX)}
     absent = {log: reason for log in recorded if (reason := reason_missing(log))}
     report.body += [f"Skipped {log}: {reason}." for log, reason in absent.items()]
@@ -145,7 +145,7 @@ def _run_set(settings: Settings, report: Report) -> dict[str, Digests]:
 def _run_in_order(
     chosen: Mapping[str, ReferenceRun], logs: Mapping[str, MeasuredLog], settings: Settings
 ) -> dict[str, Run]:
-    """The runs, those that others go on from before these."""
+    """Make the runs, those that others continue before these."""
     done: dict[str, Run] = {}
     for _, group in groupby(chosen.items(), lambda item: bool(item[1].source)):
         group_runs = dict(group)
@@ -183,7 +183,7 @@ def _digest(content: bytes) -> str:
 
 
 def _driven_digests(runs: Mapping[str, Run], settings: Settings) -> dict[str, Digests]:
-    """The digests of a robot that the explorer drives, and of one that the pilot drives on a map."""
+    """The digests of drives by the explorer, and by the pilot in a saved map."""
     folder = runs["institute"].folder / HMT_MAP
     with ProcessPoolExecutor(settings.runner.jobs, multiprocessing.get_context("spawn")) as pool:
         explorer = pool.submit(_explorer_digests, settings.changes)
@@ -192,7 +192,7 @@ def _driven_digests(runs: Mapping[str, Run], settings: Settings) -> dict[str, Di
 
 
 def _explorer_digests(changes: Sequence[str]) -> Digests:
-    """An exploration up to a time, and the robot's way."""
+    """Digest of the path and the result of an exploration up to a time."""
     configuration = load_configuration(PARAMETERS, list(changes))
     run = DrivenRun(_make_robot(0), configuration, Explorer(configuration))
     outcome = run.run_task(Task("explore"), _EXPLORATION)
@@ -200,7 +200,7 @@ def _explorer_digests(changes: Sequence[str]) -> Digests:
 
 
 def _pilot_digests(folder: Path, changes: Sequence[str]) -> Digests:
-    """A mission to the last room of a saved map, by a robot that woke up in it, and the robot's way."""
+    """Digest of the path and the result of a mission to the last room of a saved map, without an initial pose."""
     configuration = load_configuration(PARAMETERS, list(changes))
     state, _ = read_run_state(folder)
     pilot = PilotProcess(configuration, state.processes["tsbi"].replica)

@@ -1,4 +1,4 @@
-"""Maps of scripted drives through a simulated institute, and their charts beside the truth."""
+"""Maps of scripted drives through a simulated institute, and their charts compared with the truth."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from hmt_slam_ros.simulation.scenario import Scenario
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 LASER = "field_of_view=360,beams=720"
-"""As the paper's robot has it."""
+"""The laser of the paper's robot."""
 
 PEOPLE = 4
-"""Who walk about."""
+"""Number of people."""
 
 NEAR = 1.0
 """Largest distance from a state to the node of the chart that is it, m."""
@@ -36,9 +36,9 @@ class InstituteMap(NamedTuple):
     :ivar scenario: the drive.
     :ivar hybrid_map: the map at its end.
     :ivar scans: {keyframe: scan}.
-    :ivar views: {area: what its keyframes show}.
+    :ivar views: {area: view of its keyframes}.
     :ivar chart: of the map.
-    :ivar frames: {area: ``world_T_area`` (3,)}, that in which the area's keyframes are nearest to where they were.
+    :ivar frames: {area: ``world_T_area`` (3,)}, the best fit to the true poses of the area's keyframes.
     """
 
     scenario: Scenario
@@ -56,11 +56,11 @@ class InstituteMap(NamedTuple):
 
 
 class ChartScores(NamedTuple):
-    """A chart against the truth.
+    """The scores of a chart.
 
-    :ivar states: how many there are.
-    :ivar detected: how many of these are nodes.
-    :ivar confused: how many nodes are confused.
+    :ivar states: number of true states.
+    :ivar detected: number of true states that have a node.
+    :ivar confused: number of nodes of a wrong kind, or at no state.
     :ivar offsets: distances of nodes from their states, m.
     """
 
@@ -94,7 +94,7 @@ def chart_map(
     true_poses: Callable[[Int64], Float64],
     configuration: Configuration,
 ) -> InstituteMap:
-    """A map and its chart.
+    """Make the chart of a map.
 
     :param scans: {keyframe: scan}.
     :param true_poses: gives ``world_T_base`` (n, 3) at stamps (n,), ns.
@@ -111,7 +111,7 @@ def chart_map(
 
 
 def score_chart(institute: InstituteMap) -> ChartScores:
-    """A chart beside the truth."""
+    """Compare a chart with the truth."""
     states, nodes = institute.scenario.building.states, institute.chart.nodes
     distances = np.hypot(*(institute.nodes[:, None, :2] - states.poses[None, :, :2]).transpose(2, 0, 1))
     inner = np.array([node.kind != END for node in nodes])

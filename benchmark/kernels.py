@@ -35,24 +35,22 @@ _REPEATS = 3
 Keyframes = list[tuple[Scan, NDArray[np.float64]]]
 
 TIMES = (
-    "CPU time, the least of three repetitions with kernels compiled. A keyframe every half metre or twenty degrees of "
-    "the log's odometry is entered into the maps of the particles, which stand beside each other a few centimetres "
-    "apart; every forty keyframes the maps are forgotten, as at a change of area. Scans are simulated in an office "
-    "with people in it, 361 beams each, by ray casting alone and with all that belongs to a scan; a laser of 10 Hz "
-    "takes 100 000 us for one."
+    "CPU time, the least of three repetitions, with compiled kernels. A keyframe every half meter or twenty degrees of "
+    "odometry is inserted into the maps of the particles, which are a few centimeters apart; the maps are cleared every "
+    "forty keyframes, as at a change of area. Scans are simulated in an office with people, 361 beams each, by ray "
+    "casting alone and with all other steps; a laser of 10 Hz has 100 000 us for one."
 )
 ALLOCATIONS = (
-    "The same log mapped whole: how many arrays numba's runtime takes from the heap in a call of each kernel that "
-    "Python calls, with all kernels that it calls itself. Their number is the same for any number of beams, particles "
-    "and steps, so that the loops over them take none: the log-likelihood of a point, a step of Gauss-Newton, the "
-    "proposal of a particle and the beams that enter its map."
+    "The whole log is mapped. The table counts the arrays that numba's runtime allocates in a call of each kernel from "
+    "Python, including the kernels that it calls. Their number is independent of beams, particles and steps: the loops "
+    "over these allocate none."
 )
 
 
 class Timer:
-    """CPU seconds of pieces of work, and how much of what they did.
+    """CPU time of pieces of work, with their amounts.
 
-    The least of several repetitions counts: what is above it is other programs' doing.
+    Use the least of several repetitions: the rest is time of other programs.
     """
 
     def __init__(self) -> None:
@@ -60,19 +58,19 @@ class Timer:
         self._amounts: dict[str, int] = {}
 
     def add(self, name: str, amount: int, work: Callable[[], object]) -> None:
-        """Do a piece of work, and add it to what was done under this name."""
+        """Do a piece of work, and add its time and amount to those of a name."""
         begin = time.process_time()
         work()
         self._seconds[name] = self._seconds.get(name, 0.0) + time.process_time() - begin
         self._amounts[name] = self._amounts.get(name, 0) + amount
 
     def microseconds(self) -> dict[str, float]:
-        """{name: CPU time of one of its amounts}."""
+        """{name: CPU time for a unit of its amount, us}."""
         return {name: 1e6 * seconds / self._amounts[name] for name, seconds in self._seconds.items()}
 
 
 def measure_kernels(settings: Settings) -> Report:
-    """Time the loops on a log, the bundled one if none is named, and count what they take from the heap."""
+    """Measure time and allocations of the inner loops on some logs, by default the bundled one."""
     report = Report("kernels", "What the inner loops cost", seeds=(0,))
     configuration = load_configuration(settings=settings.changes)
     with open_logs(settings.logs_or((BUNDLED,))) as logs:
@@ -92,7 +90,7 @@ def _report_times(report: Report, name: str, log: Log, configuration: Configurat
         _measure_rtl(readings, configuration, timer)
         _measure_simulation(timer)
         rounds.append(timer.microseconds())
-    # The first round compiles, or loads what was compiled.
+    # The first round compiles kernels, or loads them.
     least = {work: min(times[work] for times in rounds[1:]) for work in rounds[0]}
     report.body += [TIMES, table([name, "[us]"], [[work, f"{times:.2f}"] for work, times in least.items()])]
     report.data[f"{name}_us"] = least
@@ -158,7 +156,7 @@ def _measure_matching(
     prior = scan_to_map.Prior(poses[0], information)
     timer.add("Gauss-Newton, a scan", 1, lambda: scan_to_map.align(points, poses[0], prior, view, mapping.alignment))
     timer.add(
-        "things that moved, a scan",
+        "dynamic rejection, a scan",
         1,
         lambda: dynamic_rejection.reject_dynamic(points, prior.mean, prior, view, mapping.alignment),
     )
@@ -201,7 +199,7 @@ def _measure_overlaps(keyframes: Keyframes, configuration: Configuration, timer:
 
 
 def _measure_rtl(readings: list[Odometry], configuration: Configuration, timer: Timer) -> None:
-    """A pose for every reading, where every third brings a new estimate."""
+    """A pose for every reading, with a new estimate at every third."""
     process, belief = Rtl(configuration), np.diag([1e-4, 1e-4, 1e-5])
 
     def play() -> None:
@@ -211,7 +209,7 @@ def _measure_rtl(readings: list[Odometry], configuration: Configuration, timer: 
                 estimate = PoseGaussian(reading.pose, belief)
                 process.handle(LocalEstimate(reading.stamp, k, 0, estimate, reading.pose, 0))
 
-    timer.add("real-time localisation, an odometry reading", len(readings), play)
+    timer.add("real-time localization, an odometry reading", len(readings), play)
 
 
 def _measure_simulation(timer: Timer) -> None:

@@ -1,4 +1,4 @@
-"""Recovery of a robot that is carried elsewhere while it drives: delay and correctness."""
+"""Recovery of a kidnapped robot: delay and correctness."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ from hmt_slam_ros.sensors import Scan
 WORLDS = ("office", "busy", "nested", "hall", "ring")
 LOGS = ("aces", "intel")
 ALIKE = ("hall", "ring")
-"""Worlds in which a robot may see the same where it is put as where it would be, or nothing."""
+"""Worlds in which a kidnapping may be invisible, because the view is the same or empty."""
 
 KINDS = ("known", "unknown", "short")
 SEEDS = 10
 
 SOON, SHARE = 5.0, 0.95
-"""m of travel within which it is to be noticed, and in what share of the cases."""
+"""Path within which a kidnapping has to be detected, m, and smallest share of the cases."""
 
 SURE, LOST_LIMIT = 0.9, 0.1
-"""Probability of its place from which on a robot is sure, and that of being lost up to which it says that it knows."""
+"""Smallest probability of the place of a sure robot, and largest one of being lost of a localized robot."""
 
 _RIGHT, _RIGHT_ANGLE, _DRIFT = 0.5, math.radians(10.0), 0.03
 _DRAWS = 2009
 _JUMP = 0.6  # m and rad, in the time between two scans
-_STEP = 2.5  # m, that a robot is carried which is only turned and put aside
-# Part of the drive after which the robot is carried, and from which it goes on.
+_STEP = 2.5  # m, by which a robot is moved in short kidnappings
+# Parts of the drive after which the robot is kidnapped, and from which it continues.
 _AT = {"known": (0.55, 0.7), "unknown": (0.15, 0.25), "short": (0.2, 0.7)}
 _TO = {"known": (0.72, 0.85), "unknown": (0.3, 0.4)}
 
@@ -65,14 +65,14 @@ POLICY = (
 
 @dataclass(frozen=True)
 class Kidnapping:
-    """What came of one drive.
+    """The scores of one drive.
 
-    :ivar noticed: m of travel until the robot was not sure of its place, or right again; inf where it never was.
-    :ivar again: m of travel until it was sure of the right place and stayed so; inf where it never was.
-    :ivar confident: m of travel on which it was sure of a wrong place, after it was noticed.
-    :ivar wrong: whether it was so at the end.
-    :ivar errors: mean error of translation at the relations of what was driven before and after, m.
-    :ivar driven: m, after.
+    :ivar noticed: path until the robot was not localized, or right again, m; inf if it never was.
+    :ivar again: path until it was sure of the right place and stayed so, m; inf if it never was.
+    :ivar confident: path after the detection on which it was sure of a wrong place, m.
+    :ivar wrong: whether it was sure of a wrong place at the end.
+    :ivar errors: mean error of translation at relations before and after the kidnapping, m.
+    :ivar driven: path after the kidnapping, m.
     """
 
     noticed: float
@@ -84,7 +84,7 @@ class Kidnapping:
 
 
 def draw_drive(world: str, kind: str, seed: int) -> str:
-    """The name of a simulated drive in which the robot is carried."""
+    """The name of a random simulated drive with a kidnapping."""
     random = np.random.Generator(np.random.Philox(key=[_DRAWS + seed, KINDS.index(kind)]))
     at, turned = random.uniform(*_AT[kind]), random.uniform(-180.0, 180.0)
     name = f"{SIMULATION_PREFIX}{world},seed={seed},laps=2"
@@ -100,11 +100,11 @@ def draw_drive(world: str, kind: str, seed: int) -> str:
 
 
 class LocalizationReport(NamedTuple):
-    """What a robot said of its place at a keyframe event.
+    """The localization of a robot at a keyframe event.
 
-    :ivar traveled: m, since it was carried.
-    :ivar localized: whether it says that it knows its place.
-    :ivar is_sure: whether it is sure of it.
+    :ivar traveled: path since the kidnapping, m.
+    :ivar localized: whether lost hypotheses have a probability of ``LOST_LIMIT`` at most.
+    :ivar is_sure: whether hypotheses that are not lost have the probability ``SURE``.
     :ivar is_right: whether its estimate is right.
     """
 
@@ -115,11 +115,11 @@ class LocalizationReport(NamedTuple):
 
 
 class MonitoredRun:
-    """A run, and what it says of the robot's place.
+    """A run with the truth, which reports its localization.
 
     :ivar run: the five processes.
     :ivar true: {keyframe event: ``world_T_base`` (3,)}.
-    :ivar kidnap_event: the first keyframe event after the robot was carried, -1 before.
+    :ivar kidnap_event: the first keyframe event after the kidnapping, -1 before.
     """
 
     def __init__(self, changes: Sequence[str] = ()) -> None:
@@ -130,16 +130,16 @@ class MonitoredRun:
 
     @property
     def events(self) -> int:
-        """Keyframe events so far."""
+        """Number of keyframe events."""
         return len(self.run.recorder.keyframes)
 
     def lost_probability(self) -> float:
-        """Probability that the robot may be anywhere."""
+        """Probability of the lost hypotheses."""
         hypotheses = self.run.recorder.hypotheses
         return sum(hypothesis.probability for hypothesis in hypotheses[max(hypotheses)].hypotheses if hypothesis.lost)
 
     def is_sure(self) -> bool:
-        """Whether the robot is sure of its place."""
+        """Whether hypotheses that are not lost have the probability ``SURE``."""
         hypotheses = self.run.recorder.hypotheses
         return (
             sum(hypothesis.probability for hypothesis in hypotheses[max(hypotheses)].hypotheses if not hypothesis.lost)
@@ -147,7 +147,7 @@ class MonitoredRun:
         )
 
     def is_right(self, true: NDArray[np.float64]) -> bool:
-        """Whether the last estimate is where the map of before has the robot.
+        """Whether the last estimate agrees with the map of before the kidnapping.
 
         :param true: ``world_T_base``, shape (3,).
         """
@@ -170,7 +170,7 @@ class MonitoredRun:
         return bool(near and abs(error[2]) <= _RIGHT_ANGLE)
 
     def _areas(self) -> dict[int, NDArray[np.float64]]:
-        """{area: ``map_T_area``, shape (3,)} as TLCA told last."""
+        """{area: ``map_T_area``, shape (3,)} of the last closure decision with poses."""
         decisions = self.run.recorder.decisions
         for sequence in sorted(decisions, reverse=True):
             if decisions[sequence].global_poses:
@@ -178,7 +178,7 @@ class MonitoredRun:
         return {}
 
     def report(self, true: NDArray[np.float64], traveled: float) -> LocalizationReport | None:
-        """What is said at a keyframe event, None where the last scan was none or nobody carried the robot yet."""
+        """The report at a keyframe event after the kidnapping; None for other scans."""
         if self.events - 1 in self.true:
             return None
         self.true[self.events - 1] = true
@@ -188,7 +188,7 @@ class MonitoredRun:
 
 
 def drive_kidnapped(name: str, changes: Sequence[str] = ()) -> Kidnapping:
-    """Drive through a simulated world in which the robot is carried."""
+    """Drive through a simulated world with a kidnapping."""
     monitored, traveled = MonitoredRun(changes), 0.0
     reports: list[LocalizationReport] = []
     stamps, truth, parts = list[int](), list[NDArray[np.float64]](), list[bool]()
@@ -215,11 +215,11 @@ def drive_kidnapped(name: str, changes: Sequence[str] = ()) -> Kidnapping:
 
 
 def summarize_drive(reports: Sequence[LocalizationReport], errors: tuple[float, float], traveled: float) -> Kidnapping:
-    """What came of a drive.
+    """The scores of a drive.
 
-    :param reports: after the robot was carried, at least once.
-    :param errors: before and after, m.
-    :param traveled: after, m.
+    :param reports: after the kidnapping, at least one.
+    :param errors: before and after the kidnapping, m.
+    :param traveled: path after the kidnapping, m.
     """
     noticed = next((report.traveled for report in reports if not report.localized or report.is_right), math.inf)
     again = math.inf
@@ -244,10 +244,10 @@ def _error(own: StampedPoses, truth: StampedPoses, chosen: NDArray[np.bool_]) ->
 
 @dataclass(frozen=True)
 class OrdinaryDrive:
-    """An ordinary drive.
+    """The scores of a drive without a kidnapping.
 
     :ivar driven: m.
-    :ivar unsure: m of that on which the robot said that it does not know its place.
+    :ivar unsure: path on which the robot was not localized, m.
     """
 
     driven: float
@@ -255,7 +255,7 @@ class OrdinaryDrive:
 
 
 def drive_ordinary(path: Path | str, changes: Sequence[str] = ()) -> OrdinaryDrive:
-    """Drive where nobody carries the robot."""
+    """Drive without a kidnapping."""
     monitored, driven, unsure = MonitoredRun(changes), 0.0, 0.0
     for record in open_log(path).records():
         before = monitored.events
@@ -268,9 +268,9 @@ def drive_ordinary(path: Path | str, changes: Sequence[str] = ()) -> OrdinaryDri
 
 
 def measure_kidnapping(settings: Settings) -> Report:
-    """Carry the robot in every world, and drive where nobody does."""
+    """Drive in every world, with and without kidnappings."""
     seeds = settings.seeds_or(SEEDS)
-    report = Report("kidnapping", "A robot that is carried while it drives", seeds=seeds)
+    report = Report("kidnapping", "A robot that is kidnapped while it drives", seeds=seeds)
     names = settings.logs_or((*WORLDS, *LOGS))
     worlds = [name for name in names if name in WORLDS]
     cases = [(world, kind, seed) for world in worlds for kind in KINDS for seed in seeds]
@@ -291,7 +291,7 @@ def measure_kidnapping(settings: Settings) -> Report:
             report.data[f"{world} {kind}"] = [asdict(kidnapping) for kidnapping in kidnappings]
             if world not in ALIKE:
                 report.requirements += requirements(f"{world}, {kind}", kidnappings)
-    head = ["world", "carried to", "drives", f"noticed within {SOON:g} m", "m until noticed, median"]
+    head = ["world", "kidnapped to", "drives", f"noticed within {SOON:g} m", "m until noticed, median"]
     head += ["right at the end", "m until right, median", "m sure of a wrong place", "wrong at the end"]
     head += ["error before [m]", "after [m]"]
     report.body.append(table(head, rows))
@@ -312,7 +312,7 @@ def measure_kidnapping(settings: Settings) -> Report:
 
 
 def requirements(name: str, found: Sequence[Kidnapping]) -> list[Requirement]:
-    """What is asked for: that it is noticed soon, and that no wrong place is taken for certain."""
+    """Requirements on the delay of detections, and on confident wrong answers."""
     noticed = float(np.mean([kidnapping.noticed <= SOON for kidnapping in found]))
     wrong = sum(kidnapping.confident > 0.0 or kidnapping.wrong for kidnapping in found)
     return [

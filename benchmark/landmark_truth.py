@@ -19,15 +19,15 @@ Array = NDArray[np.float64]
 REACH = 6.0
 """Landmarks farther away, m, do not have to be found."""
 
-_LEAST_ARM = 0.2  # m, of a corner that may be found
-_BESIDE = 0.03  # m, from a surface, where it is looked at
-_WIDE = math.radians(3.0)  # under which a wall has to be seen
-_CLEAR = 0.25  # share of an opening's width through which the robot has to see
-_JAMB = 0.3  # m of the wall that have to be in sight beside it
+_LEAST_ARM = 0.2  # smallest length of the arms of a corner, m
+_BESIDE = 0.03  # distance from a surface of the points that are checked for visibility, m
+_WIDE = math.radians(3.0)  # smallest visible angle of a wall
+_CLEAR = 0.25  # smallest visible share of an opening's width
+_JAMB = 0.3  # smallest visible length of wall beside it, m
 
 
 _SAMPLES = 20  # over the width of an opening
-_FLAT = 0.05  # sine, below which nothing is seen of what is behind a wall's line
+_FLAT = 0.05  # sine of the smallest viewing angle through an opening
 _ON = 1e-6  # m
 _COS, _SIN = math.cos(0.1234), math.sin(0.1234)
 
@@ -37,7 +37,7 @@ class Truth(NamedTuple):
 
     :ivar poses: shape (n, 3), as of `Corners` or `Openings`, m and rad.
     :ivar kinds: shape (n,), of a corner whether it is convex, of an opening its width, m.
-    :ivar due: shape (n,), whether the robot's surroundings show enough of it for it to have to be found.
+    :ivar due: shape (n,), whether enough of it is visible that it has to be found.
     """
 
     poses: Array
@@ -49,7 +49,7 @@ _NOTHING = Truth(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.bool_))
 
 
 class World:
-    """Walls, the leaves of closed doors, and furniture around the robot, in its frame."""
+    """Walls, panels of closed doors and furniture around the robot, in its frame."""
 
     def __init__(self, scenario: Scenario, stamp: int, pose: Array) -> None:
         building = scenario.building.walls
@@ -60,13 +60,13 @@ class World:
         self.index: WallIndex = wall_index(self.surfaces)
 
     def is_visible(self, points: Array) -> NDArray[np.bool_]:
-        """Which points (..., 2) are in sight."""
+        """Which points (..., 2) are visible from the robot, shape (...)."""
         flat = np.ascontiguousarray(points.reshape(-1, 2))
         visible: NDArray[np.bool_] = has_line_of_sight(self.index, np.zeros_like(flat), flat)
         return visible.reshape(points.shape[:-1])
 
     def corners(self, features: FeatureParameters) -> Truth:
-        """All pairs of surfaces that meet at a right angle, on the sides that face the robot."""
+        """All corners of surfaces at right angles, on the sides that face the robot."""
         parts = [self._corners_of(sign_a, sign_b, features) for sign_a in (1.0, -1.0) for sign_b in (1.0, -1.0)]
         return _concatenate(parts)
 
@@ -99,14 +99,14 @@ class World:
         return _concatenate(found)
 
     def _is_shown(self, at: Array, along: Array, beside: Array, length: float) -> NDArray[np.bool_]:
-        """Whether a stretch of a surface is in sight, and not too flat."""
+        """Whether a stretch of a surface is visible under a sufficient angle."""
         places = np.linspace(0.05, length, 8)
         points = at[:, None] + places[:, None] * along[:, None] + _BESIDE * beside[:, None]
         bearing = np.arctan2(points[..., 1], points[..., 0])
         return self.is_visible(points).all(axis=1) & (np.abs(se2.wrap(bearing[:, -1] - bearing[:, 0])) >= _WIDE)
 
     def openings(self, features: FeatureParameters) -> Truth:
-        """All deep gaps between the end of a wall and what is next on its line, on the robot's side; no furniture."""
+        """All deep gaps between the end of a wall and the next surface on its line, without furniture."""
         lengths = np.hypot(*(self.building[:, 2:] - self.building[:, :2]).T)
         walls = self.building[lengths >= features.min_length]
         ends = np.concatenate((walls[:, 2:], walls[:, :2]))
@@ -115,7 +115,7 @@ class World:
         return _without_repetitions(_concatenate([_NOTHING, *gaps]))
 
     def _gap(self, end: Array, along: Array, features: FeatureParameters) -> Truth | None:
-        """The opening that begins at the end of a wall, if there is one."""
+        """The opening that begins at the end of a wall, None without one."""
         normal = np.array([-along[1], along[0]]) * (1.0 if along[0] * end[1] - along[1] * end[0] > 0.0 else -1.0)
         width, wall = self._next_on_line(end, along, normal)
         if not features.opening_min <= width <= features.opening_max:
@@ -138,7 +138,7 @@ class World:
         return Truth(pose, np.array([width]), np.array([due]))
 
     def _next_on_line(self, end: Array, along: Array, normal: Array) -> tuple[float, bool]:
-        """How far the line of a wall goes on behind its end, m, and whether to a further wall on it."""
+        """Distance from the end of a wall to the next surface on its line, m, and whether that is a wall on the line."""
         ends = self.building.reshape(-1, 2, 2) - end
         at, off = ends @ along, ends @ normal
         on = np.abs(off) < _ON
@@ -150,7 +150,7 @@ class World:
         return float(min(first)), bool(first[0] <= first[1] + _ON)
 
     def _is_closed(self, before: Array, behind: Array) -> bool:
-        """Whether a door's leaf is between two points."""
+        """Whether a door panel is between two points."""
         ends, way = self._door_panels.reshape(-1, 2, 2) - before, behind - before
         sides = ends[..., 1] * way[0] - ends[..., 0] * way[1]
         across = sides[:, 0] * sides[:, 1] < 0.0
@@ -160,9 +160,9 @@ class World:
         return bool(((crossing_share > 0.0) & (crossing_share < 1.0)).any())
 
     def is_free(self, points: Array) -> NDArray[np.bool_]:
-        """Which points (n, 2) are on the free side of the walls, (n,): from there one meets an odd number of them."""
+        """Which points (n, 2) are on the free side of the walls, (n,): a ray from there crosses an odd number of them."""
         a, b = self.building[None, :, :2] - points[:, None], self.building[None, :, 2:] - points[:, None]
-        # To the right on a slant that no wall has.
+        # Rays have a slant that no wall has.
         turned = [part @ np.array([[_COS, -_SIN], [_SIN, _COS]]) for part in (a, b)]
         (ax, ay), (bx, by) = (np.moveaxis(part, -1, 0) for part in turned)
         over = (ay > 0.0) != (by > 0.0)
@@ -183,7 +183,7 @@ def _directions(walls: Array) -> Array:
 
 
 def _arm_lengths(at: Array, walls: Array, along: Array, gap: float) -> Array:
-    """How long walls (n, 4) go on from points (n, 2), m; 0 where they begin farther away than the gap."""
+    """Lengths of walls (n, 4) from points (n, 2) on, m; 0 for those that begin beyond the gap."""
     ends = np.stack([((walls[:, k : k + 2] - at) * along).sum(axis=1) for k in (0, 2)], axis=1)
     return np.where(ends.min(axis=1) <= gap, ends.max(axis=1), 0.0)
 
@@ -197,7 +197,7 @@ def _concatenate(parts: list[Truth]) -> Truth:
 
 
 def _without_repetitions(truth: Truth) -> Truth:
-    """Each opening once, those first that are due."""
+    """Each opening once, due ones first."""
     kept: list[int] = []
     for k in np.argsort(~truth.due, kind="stable").tolist():
         if not np.any(are_near(truth.poses[kept], truth.poses[k], 0.1, 0.1)):

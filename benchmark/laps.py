@@ -36,17 +36,17 @@ from hmt_slam_ros.sensors import Scan
 
 WORLDS = ("office", "nested", "hall")
 LAPS, STEADY = 20, 3
-"""Laps of a simulated world, and after how many the memory is compared with that at the end."""
+"""Number of laps of a simulated world, and the lap from which on growth is measured."""
 
 LOGS = ("intel",)
 PASSES = 3
-"""How often a real log is played."""
+"""Number of passes of a real log."""
 
 GROWTH = 0.05
 """Largest growth of areas, keyframes and memory."""
 
 NOISE = 0.1
-"""Largest growth of what a scan costs, and of errors: they differ by as much from lap to lap."""
+"""Largest growth of the cost of a scan, and of errors, which vary as much between laps."""
 
 _BETWEEN = 60 * NANOSECONDS
 
@@ -64,14 +64,14 @@ POLICY = (
 
 @dataclass(frozen=True)
 class Lap:
-    """What a run came to after a lap.
+    """The size of a run after a lap.
 
     :ivar areas: of the most probable map.
     :ivar keyframes: likewise.
     :ivar scans: kept in memory.
-    :ivar scan_bytes: what they take.
+    :ivar scan_bytes: memory of these.
     :ivar resident: memory of the OS process, bytes.
-    :ivar recorded: of which are trajectories, for the output, bytes.
+    :ivar recorded: part of it for trajectories of the output, bytes.
     :ivar hypotheses: alive.
     :ivar milliseconds: of computing for a scan of the lap, mean.
     """
@@ -98,13 +98,13 @@ class Laps:
     errors: tuple[float, ...]
 
     def growth(self, value: Callable[[Lap], float], steady: int) -> float:
-        """From the end of lap ``steady`` to that of the last one, as a share."""
+        """Growth of a value from the end of lap ``steady`` to that of the last one, as a share."""
         return value(self.laps[-1]) / value(self.laps[steady - 1]) - 1.0
 
 
 def measure_laps(settings: Settings) -> Report:
     """Drive the laps, and compare the last with the first."""
-    report = Report("laps", "Known ground again and again", seeds=(0,))
+    report = Report("laps", "Repeated laps on known ground", seeds=(0,))
     configuration = load_configuration(PARAMETERS, list(settings.changes))
     names = settings.logs_or((*WORLDS, *LOGS))
     with open_logs([name for name in names if name not in WORLDS]) as logs:
@@ -112,7 +112,7 @@ def measure_laps(settings: Settings) -> Report:
             name: (f"{SIMULATION_PREFIX}{name},laps={LAPS}", None, LAPS) for name in names if name in WORLDS
         }
         jobs |= {log.name: (str(log.path), log.relations_file, PASSES) for log in logs}
-        # A process of its own for each: memory is what it takes.
+        # Memory is measured for a separate process of each.
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), max_tasks_per_child=1) as pool:
             runs = {name: pool.submit(drive_laps, *job, configuration) for name, job in jobs.items()}
             found = {name: run.result() for name, run in runs.items()}
@@ -124,7 +124,7 @@ def measure_laps(settings: Settings) -> Report:
 
 
 def requirements(name: str, found: Laps) -> list[Requirement]:
-    """What is asked for of a run: that what it holds, what a scan costs and what it errs are the same in late laps."""
+    """Requirements on the growth of a run: its areas, keyframes, memory, cost of a scan and error."""
     count = len(found.laps)
     steady = STEADY if count > STEADY else 1
     since = f"{name}, lap {steady} to {count}: growth of"
@@ -139,7 +139,7 @@ def requirements(name: str, found: Laps) -> list[Requirement]:
 
 
 def drive_laps(log: str, relations: Path | None, count: int, configuration: Configuration) -> Laps:
-    """Drive over a log ``count`` times, or over a simulated one that has as many laps."""
+    """Drive over a log ``count`` times, or over a simulated log with as many laps."""
     gc.freeze()
     source, run = open_log(log), LockStepRun(configuration)
     times = 1 if relations is None else count
@@ -160,7 +160,7 @@ def drive_laps(log: str, relations: Path | None, count: int, configuration: Conf
 
 
 def _replay(log: Log, count: int) -> Iterator[tuple[LogRecord, bool]]:
-    """The records of a log, over and over on one clock, and whether the robot was carried before each."""
+    """The records of repeated passes of a log on one clock, each with whether a pass begins."""
     shift = stamp = 0
     for number in range(count):
         for n, record in enumerate(log.records()):
@@ -172,7 +172,9 @@ def _replay(log: Log, count: int) -> Iterator[tuple[LogRecord, bool]]:
 
 
 def _measure_lap(run: LockStepRun, seconds: float) -> Lap:
-    """What a run is after a lap in which a scan took so many seconds."""
+    """The size of a run after a lap.\n
+    :param seconds: mean cost of a scan of the lap.
+    """
     gc.collect()
     slam = run.lock_step.processes["slam"]
     assert isinstance(slam, MetricSlam)
@@ -193,7 +195,7 @@ def _resident() -> int:
 def _lap_errors(run: LockStepRun, log: Log, known: Relations | None, ends: Sequence[int]) -> Iterator[float]:
     """Mean error at the relations of each lap, m.
 
-    :param known: those of a log of a real robot; None where its records tell the truth.
+    :param known: true relations of a real log; None for a simulated one.
     :param ends: number of scans at the end of each lap.
     """
     result = run.finish()
@@ -223,5 +225,5 @@ def _table(found: Mapping[str, Laps]) -> str:
 
 
 def _tabulated_laps(count: int) -> list[int]:
-    """The laps that stand in the table: the first ones, then every fifth, and the last."""
+    """The laps of the table: the first ones, every fifth, and the last."""
     return [lap for lap in range(1, count + 1) if lap <= STEADY or lap % 5 == 0 or lap == count]

@@ -1,6 +1,6 @@
-"""Hybrid maps of as many areas as wanted, made as data: a lattice of corridors, every crossing an area.
+"""Synthetic hybrid maps of any number of areas: a lattice of corridors, with an area at each crossing.
 
-All crossings are alike, so that a few scans serve all of them.
+All crossings are the same, so that they share a few scans.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ SPACING = 8.0
 """From crossing to crossing, m."""
 
 OFFSETS = (-3.2, -1.6, 0.0, 1.6, 3.2)
-"""Where keyframes are taken on the way through a crossing, m before or behind its centre."""
+"""Positions of keyframes along a crossing, m from its center."""
 
 PER_AREA = 2 * len(OFFSETS)
 """Keyframes of an area, half of them along each corridor."""
 
 FIRST_KEYFRAME = 10_000_000
-"""Of area 0; smaller ones are those of a run in the map."""
+"""First keyframe of area 0; smaller numbers are those of a run in the map."""
 
 BEAMS = 61
 
@@ -50,7 +50,7 @@ class Lattice(NamedTuple):
 
     @property
     def areas(self) -> int:
-        """How many."""
+        """Number of areas."""
         return self.columns * self.rows
 
     def hybrid_map(self) -> HybridMap:
@@ -68,7 +68,7 @@ class Lattice(NamedTuple):
         return hybrid_map
 
     def poses(self) -> tuple[AreaPose, ...]:
-        """Where the crossings lie, as TLCA says it."""
+        """Poses of the crossings, as of a closure decision."""
         at = (SPACING * np.array([area % self.columns, area // self.columns, 0.0]) for area in range(self.areas))
         return tuple(AreaPose(area, PoseGaussian(mean, ARC.copy())) for area, mean in enumerate(at))
 
@@ -86,18 +86,18 @@ def _make_arc(x: float, y: float) -> PoseGaussian:
 
 
 def _pose_in_crossing(offset: float, quarter: int) -> Float64:
-    """``crossing_T_base`` on the way through it, in a heading of some quarters of a turn."""
+    """``crossing_T_base`` (3,) at an offset along a corridor, with a heading in quarter turns."""
     return np.asarray(se2.compose([0.0, 0.0, 0.5 * math.pi * quarter], [offset, 0.0, 0.0]))
 
 
 @cache
 def shared_scan(offset: float, quarter: int) -> Scan:
-    """The scan on the way through any crossing, one of ``OFFSETS`` from its centre."""
+    """The scan at one of ``OFFSETS`` along a corridor, which is the same at every crossing."""
     return scan_at(_pose_in_crossing(offset, quarter), 0, quarter)
 
 
 def scan_at(pose: Float64, stamp: int, seed: int, beams: int = BEAMS) -> Scan:
-    """The scan at a pose (3,) in an endless lattice, of which a crossing lies at the origin."""
+    """The scan at a pose (3,) in an endless lattice with a crossing at the origin."""
     angles = np.linspace(-0.5 * _FIELD, 0.5 * _FIELD, beams)
     at = pose[:2] - SPACING * np.round(pose[:2] / SPACING)
     ranges = cast_rays(_wall_index(), np.tile(at, (beams, 1)), angles + pose[2], np.inf)
@@ -115,7 +115,7 @@ def _wall_index() -> WallIndex:
 
 
 class Stop(NamedTuple):
-    """A place for a keyframe on the way along some crossings.
+    """A keyframe on a path along some crossings.
 
     :ivar pose: ``lattice_T_base``, shape (3,).
     :ivar scan: the shared one.
@@ -128,7 +128,7 @@ class Stop(NamedTuple):
 
 
 def make_stops(crossings: Sequence[tuple[int, int]]) -> Iterator[Stop]:
-    """The stops on the way from the centre of the first crossing (column, row) through the next ones."""
+    """The stops on the path from the center of the first crossing (column, row) through the next ones."""
     for (column, row), (next_column, next_row) in pairwise(crossings):
         quarter = round(math.atan2(next_row - row, next_column - column) / (0.5 * math.pi)) % 4
         for offset in OFFSETS:

@@ -1,4 +1,4 @@
-"""True walls of a simulated scan as lines, and which of them each beam met."""
+"""True walls of a simulated scan as lines, and the line that each beam hits."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from hmt_slam_ros.simulation.scenario import Scenario
 
 Array = NDArray[np.float64]
 
-_ON = 1e-4  # m, from a wall, of what met it
-_DECIMALS = 6  # of radians and metres: walls that agree to these lie on one line
+_ON = 1e-4  # largest distance of a hit from its wall, m
+_DECIMALS = 6  # of radians and meters, to which walls on one line agree
 
 
 class TrueScan(NamedTuple):
-    """A scan and what there was to be seen in it.
+    """A scan with the true lines.
 
-    :ivar scan: as the laser has it, corrected for the true motion during its sweep.
+    :ivar scan: of the laser, corrected for the true motion during its sweep.
     :ivar lines: shape (n, 2), alpha and r of the lines on which walls and furniture lie, in the robot's frame, rad, m;
-        numbered alike at all times at which the furniture stands alike.
-    :ivar hit_lines: shape (k,), the line that each beam with a return met, -1 for a person.
-    :ivar ends: shape (k, 2), where it truly ended, m, in that frame.
+        with the same numbers at all times without a change of furniture.
+    :ivar hit_lines: shape (k,), the line that each beam with a return hits, -1 for a person.
+    :ivar ends: shape (k, 2), true end points of these beams, m, in that frame.
     """
 
     scan: Scan
@@ -43,7 +43,7 @@ def lines_of(walls: Array) -> Array:
 
 
 def line_difference(line: Array, other: Array) -> Array:
-    """other - line, both (..., 2), in that representation of the other whose angle is nearer."""
+    """other - line, both (..., 2), in the representation of the other line with the nearer angle."""
     turn = se2.wrap(other[..., 0] - line[..., 0])
     opposite = np.abs(turn) > 0.5 * np.pi
     away = np.where(opposite, -other[..., 1], other[..., 1]) - line[..., 1]
@@ -51,7 +51,7 @@ def line_difference(line: Array, other: Array) -> Array:
 
 
 def true_scan(scenario: Scenario, number: int) -> TrueScan:
-    """A scan of a drive by its number, and the truth about it."""
+    """A scan of a drive by its number, with the true lines."""
     scan, laser = scenario.scan(number), scenario.laser
     poses = scenario.true_poses(scan.stamp + np.round(1e9 * laser.times).astype(np.int64))
     scan = replace(scan, motion=se2.log(se2.between(poses[0], poses[-1])))
@@ -81,7 +81,7 @@ def _surfaces(scenario: Scenario, stamp: int, pose: Array) -> tuple[Array, NDArr
 
 
 def _hit_walls(walls: Array, ends: Array) -> NDArray[np.int64]:
-    """The wall (n, 4) on which each point (k, 2) lies, -1 for none."""
+    """The index of the wall (n, 4) on which each point (k, 2) lies, shape (k,), -1 for none."""
     starts, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
     away = ends[:, None] - starts[None]
     share = np.clip((away * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)

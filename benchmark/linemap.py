@@ -22,27 +22,27 @@ from hmt_slam_ros.simulation.furniture import Rectangle, furnish
 from hmt_slam_ros.simulation.scenario import Scenario
 from hmt_slam_ros.simulation.settings import Settings, chosen_settings, parse_name
 
-_EVERY = 25  # scans between two looks at the pose
+_EVERY = 25  # scans between two checks of the pose
 _WALL = 0.2  # m, between two rooms
-_INSET = 1.1  # m, of the robot's way from the walls
+_INSET = 1.1  # distance of the robot's route from the walls, m
 _DOOR = 1.0  # m
 
 KINDS = {
     "room": "a furnished room with an open door",
     "office": "two furnished rooms, one through the other",
-    "busy office": "the same with two people on the robot's way",
+    "busy office": "the same with two people on the robot's route",
 }
-"""{name: what it is}."""
+"""{name: description}."""
 
 
 class LineMapScores(NamedTuple):
-    """What a drive came to.
+    """The scores of the line map of a drive.
 
     :ivar pose_nees: of the robot's pose, 3 degrees of freedom.
     :ivar pose_sigmas: shape (n, 3), deviations of x, y and heading, m and rad, at the same times.
     :ivar pose_errors: shape (n, 3), in the robot's frame, likewise.
-    :ivar strays: lines that have no wall.
-    :ivar bytes: of the lines, and with their covariance.
+    :ivar strays: number of lines without a wall.
+    :ivar bytes: memory of the lines, and with their covariance.
     :ivar floor: m^2.
     """
 
@@ -82,7 +82,7 @@ def map_rooms(kind: str, seed: int, laser: str, configuration: Configuration) ->
 
 
 def _odometry_step(scenario: Scenario, number: int, configuration: Configuration) -> RelativeMotion:
-    """What odometry says of the motion to a scan."""
+    """The motion to a scan by odometry."""
     readings = scenario.settings.readings
     before, here = scenario.odometry[(number - 1) * readings], scenario.odometry[number * readings]
     increment = se2.between(before, here)
@@ -113,7 +113,7 @@ def drive_in(kind: str, seed: int, settings: str) -> tuple[Scenario, float]:
         low = max(first[1], second[1]) + _INSET - 0.5 * _DOOR
         plan.cut_rectangle(first[2] - 0.05, low, left + 0.05, low + _DOOR)
         way = _through_door(way, _loop_around(second), low + 0.5 * _DOOR)
-    # A door in the first room's upper wall, and what is seen of the corridor behind it.
+    # A door in the first room's upper wall, and the visible part of the corridor behind it.
     door = draw.uniform(0.5, first[2] - 0.5 - _DOOR)
     plan.cut_rectangle(door, first[3] - 0.05, door + _DOOR, first[3] + _WALL + 0.05)
     plan.cut_rectangle(-2.0, first[3] + _WALL, first[2] + 2.0, first[3] + _WALL + 2.0)
@@ -132,7 +132,7 @@ def _settings(kind: str, seed: int, settings: str) -> Settings:
 
 
 def _loop_around(room: Rectangle) -> list[Point]:
-    """Once around a room, from its lower right corner on, counter-clockwise."""
+    """A counterclockwise loop in a room, from its lower right corner on."""
     x0, y0, x1, y1 = room[0] + _INSET, room[1] + _INSET, room[2] - _INSET, room[3] - _INSET
     return [(x1, y0), (x1, y1), (x0, y1), (x0, y0), (x1, y0)]
 

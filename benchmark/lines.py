@@ -22,7 +22,7 @@ _SCANS = 60  # of every drive
 
 
 class Line(NamedTuple):
-    """A line that has a wall.
+    """A line on a true wall.
 
     :ivar nees: of alpha and r.
     :ivar alpha: deviation, rad.
@@ -35,12 +35,12 @@ class Line(NamedTuple):
 
 
 class ScanLines(NamedTuple):
-    """What was found in one scan.
+    """The scores of the lines of one scan.
 
-    :ivar lines: those that have a wall.
-    :ivar strays: number of those on none.
-    :ivar visible_length: length of the walls that beams met, m.
-    :ivar found_length: what of it is on lines, m.
+    :ivar lines: on true walls.
+    :ivar strays: number of lines on no wall.
+    :ivar visible_length: of the walls that beams hit, m.
+    :ivar found_length: part of it that is on lines, m.
     :ivar seconds: of CPU time.
     """
 
@@ -52,7 +52,7 @@ class ScanLines(NamedTuple):
 
 
 def extract_scans(world: World, laser: str, features: FeatureParameters) -> Iterator[ScanLines]:
-    """What is found in scans of a drive.
+    """The lines of scans of a drive.
 
     :param laser: settings that differ from the world's.
     """
@@ -80,7 +80,7 @@ def _extract_scan(scenario: Scenario, number: int, features: FeatureParameters) 
 
 
 def walls_of(lines: Lines, scan: TrueScan) -> NDArray[np.int64]:
-    """The true line of each line, shape (n,), -1 where it has none."""
+    """The true line of each line, shape (n,), -1 for none."""
     walls = np.full(len(lines), -1)
     for k in range(len(lines)):
         numbers, counts = np.unique(scan.hit_lines[lines.labels == k], return_counts=True)
@@ -90,7 +90,7 @@ def walls_of(lines: Lines, scan: TrueScan) -> NDArray[np.int64]:
 
 
 def _wall_lengths(lines: Lines, walls: NDArray[np.int64], scan: TrueScan) -> tuple[float, float]:
-    """Length of walls between neighbouring beams that met the same one, and what of it is on a line of that wall, m."""
+    """Length of walls between adjacent beams that hit the same one, and the part on a line of that wall, m."""
     own = scan.hit_lines[1:]
     same = (own == scan.hit_lines[:-1]) & (own >= 0)
     first, second, own = scan.ends[:-1][same], scan.ends[1:][same], own[same]
@@ -110,12 +110,12 @@ def mean_nees(drives: Sequence[Sequence[ScanLines]]) -> float:
 
 
 def stray_share(drives: Sequence[Sequence[ScanLines]]) -> float:
-    """Of all lines, those on no wall."""
+    """Share of the lines on no wall."""
     strays = sum(scan.strays for drive in drives for scan in drive)
     lines = sum(len(scan.lines) for drive in drives for scan in drive)
     return strays / (lines + strays) if lines + strays else math.nan
 
 
 def mean_milliseconds(drives: Sequence[Sequence[ScanLines]]) -> float:
-    """CPU time of a scan, mean."""
+    """Mean CPU time of a scan, ms."""
     return 1e3 * float(np.mean([scan.seconds for drive in drives for scan in drive]))

@@ -38,19 +38,19 @@ FAST = "sim:office,rate=40,readings=3,beams=1080,field_of_view=270"
 """A drive with 40 scans a second of 1080 beams."""
 
 SECONDS = 60.0
-"""Of each drive."""
+"""Duration of each drive, s."""
 
 LATENCY = 0.010
 """Largest time from an odometry message to its pose, at 99 of 100, s."""
 
 BEHIND = 0.5
-"""How far behind metric SLAM may be in the end with the fast laser, s."""
+"""Largest delay of metric SLAM at the end with the fast laser, s."""
 
 RATE = 10.0
-"""Times real time at which logs are replayed."""
+"""Speed of replays relative to real time."""
 
 LATER = 1.1
-"""How much longer a replay may take than its log at that rate."""
+"""Largest ratio of the time of a replay to that of its log at that rate."""
 
 _TIMEOUT = 3600.0
 
@@ -67,7 +67,7 @@ Stamped = dict[int, float]
 
 
 class MessageTimes(NamedTuple):
-    """When messages were published, by the stamps in their headers.
+    """Times at which messages were published, by the stamps in their headers.
 
     :ivar sent: {stamp, ns: s}.
     :ivar received: likewise.
@@ -78,13 +78,13 @@ class MessageTimes(NamedTuple):
 
     @property
     def delays(self) -> NDArray[np.float64]:
-        """Of all that were answered, s."""
+        """Delays of all answered messages, s."""
         return np.array([moment - self.sent[stamp] for stamp, moment in self.received.items() if stamp in self.sent])
 
 
 def measure_live(settings: Settings) -> Report:
-    """Let the nodes keep up with a robot."""
-    report = Report("live", "Keeping time")
+    """Measure the delays of the nodes, with drives and with replays."""
+    report = Report("live", "Latency of the nodes")
     poses, scans = measure_saturated(BUSY, SECONDS), measure_fast(FAST, SECONDS)
     requirements = [
         Requirement("odometry to pose, all else saturated, p99", float(np.quantile(poses.delays, 0.99)), LATENCY, "s"),
@@ -110,7 +110,7 @@ def measure_live(settings: Settings) -> Report:
 
 
 def measure_saturated(log: str, seconds: float) -> MessageTimes:
-    """From odometry to pose, while the machine is busy otherwise."""
+    """Times of odometry and poses, while all cores are busy."""
     with _run_nodes() as listener, _saturate_cores():
         sent = _collect_times(listener, Odometry, ODOM, topics.SENSOR)
         received = _collect_times(listener, PoseWithCovarianceStamped, POSE, topics.STREAM)
@@ -119,7 +119,7 @@ def measure_saturated(log: str, seconds: float) -> MessageTimes:
 
 
 def measure_fast(log: str, seconds: float) -> MessageTimes:
-    """From scan to estimate."""
+    """Times of scans and estimates, with a fast laser."""
     with _run_nodes() as listener:
         sent = _collect_times(listener, LaserScan, SCAN, topics.SENSOR)
         received: Stamped = {}
@@ -135,11 +135,11 @@ def measure_fast(log: str, seconds: float) -> MessageTimes:
 
 
 class ReplayScores(NamedTuple):
-    """What came of a replay.
+    """The scores of a replay.
 
     :ivar scans: of the log.
-    :ivar answered_scans: those that were given a pose.
-    :ivar time_ratio: its time, of that which it has at this rate.
+    :ivar answered_scans: number of scans with a pose.
+    :ivar time_ratio: ratio of its time to that of the log at this rate.
     """
 
     scans: int
@@ -148,7 +148,7 @@ class ReplayScores(NamedTuple):
 
 
 def replay_log(log: str) -> ReplayScores:
-    """A log at ten times real time."""
+    """Replay a log at ten times real time."""
     duration = open_log(log).duration / RATE
     with _run_nodes() as listener:
         answered_scans = _count_documents(listener, DOCUMENTS[LocalEstimate])
@@ -160,13 +160,13 @@ def replay_log(log: str) -> ReplayScores:
 
 
 def count_unanswered(passed: MessageTimes) -> int:
-    """Messages without an answer since the first one that had one."""
+    """Number of messages without an answer since the first answered one."""
     first = min(passed.received)
     return sum(stamp not in passed.received for stamp in passed.sent if stamp >= first)
 
 
 def _count_documents(listener: Listener, topic: str) -> Callable[[], int]:
-    """How many documents of a topic there were."""
+    """A function that returns the number of documents of a topic since now."""
     documents: list[None] = []
     listener.node.create_subscription(String, topic, lambda _message: documents.append(None), topics.CHAIN)
     return lambda: len(documents)
@@ -182,7 +182,7 @@ def _replay_table(replays: dict[str, ReplayScores]) -> str:
 
 @contextmanager
 def _run_nodes() -> Iterator[Listener]:
-    """A listener, beside which all five nodes run."""
+    """All five nodes as processes, with a listener."""
     with ExitStack() as stack:
         listener = stack.enter_context(Listener())
         for name in PROCESSES:
@@ -192,7 +192,7 @@ def _run_nodes() -> Iterator[Listener]:
 
 @contextmanager
 def _saturate_cores() -> Iterator[None]:
-    """As many processes as there are cores that do nothing but compute."""
+    """A computing process for every core."""
     burners = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
     try:
         yield
@@ -211,10 +211,10 @@ def _play_log(
     *,
     flow_control: bool = False,
 ) -> RobotStatus:
-    """A robot that plays a log to its end; what it said then.
+    """Play a log to its end by the robot node; return the last status.
 
     :param seconds: of the log that are played; 0 for all.
-    :param monitored_topic: the robot's topic that the listener hears too.
+    :param monitored_topic: the robot's topic that the listener has subscribed to.
     """
     statuses: list[RobotStatus] = []
     listener.node.create_subscription(
@@ -235,7 +235,7 @@ def _play_log(
 
 
 def _collect_times(listener: Listener, kind: type, topic: str, profile: QoSProfile) -> Stamped:
-    """Filled with when messages were published, by the stamps in their headers."""
+    """A dictionary that collects {stamp of a message: time at which it was published, s}."""
     times: Stamped = {}
 
     def add_time(message: Odometry, info: dict[str, int]) -> None:

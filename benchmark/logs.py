@@ -1,4 +1,4 @@
-"""Logs that are measured on, decompressed where needed."""
+"""Recorded logs for measurements, decompressed where needed."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WITH_RELATIONS = tuple(name for name, (_, relations) in _FILES.items() if relati
 
 @dataclass(frozen=True)
 class MeasuredLog:
-    """A log, and what is known about it; two of the same name are equal, wherever they were decompressed to.
+    """A log with its truth; two of the same name are equal, wherever they were decompressed.
 
     :ivar name: one of ``LOGS``.
     :ivar path: of the log, as ``hmt_slam map`` takes it.
@@ -67,7 +67,7 @@ def dataset_folder() -> Path:
 
 
 def reason_missing(name: str) -> str:
-    """Why a log cannot be had, as a sentence; empty where it can.
+    """The sentence that says why a log is missing; empty for one that is there.
 
     :param name: one of ``LOGS``.
     """
@@ -77,9 +77,9 @@ def reason_missing(name: str) -> str:
 
 @contextmanager
 def open_logs(names: Sequence[str]) -> Iterator[list[MeasuredLog]]:
-    """The logs of some names, decompressed into a folder that vanishes at the end.
+    """The logs of some names, decompressed into a temporary folder.
 
-    :raises HmtSlamError: for a name that is none, or a file that is not there.
+    :raises HmtSlamError: for an unknown name or a missing file.
     """
     for name in names:
         if name not in LOGS:

@@ -1,9 +1,9 @@
-"""Run a program and tell what it cost: ``python -m benchmark.measured PROGRAM ARGUMENTS``.
+"""Run a program and print its cost: ``python -m benchmark.measured PROGRAM ARGUMENTS``.
 
-The last line of standard output is a JSON object; all that the program says goes to standard error.
+The last line of standard output is a JSON object; the output of the program goes to standard error.
 
-Why in a process of its own: to Linux, the largest resident memory of a program is at least that of the process that
-started it. This one imports nothing that is large.
+It is a separate process, because Linux gives a program at least the peak memory of the process that started it. This
+one imports nothing large.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def measure_cost(command: list[str]) -> dict[str, float]:
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=sys.stderr)
     signal.signal(signal.SIGTERM, lambda *_: process.terminate())
     if sys.platform == "linux":
-        # Whoever started this may die without a word; then the program ends too.
+        # The program ends with the process that started this one, even if that is killed.
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)

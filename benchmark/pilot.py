@@ -1,4 +1,4 @@
-"""Errands of the pilot through nodes, in an institute that was explored."""
+"""Tasks of the pilot through nodes, in an institute that was explored."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from std_msgs.msg import String
 
 from benchmark.driven_run import DrivenRun
-from benchmark.explore import is_within
-from benchmark.institute import AT_PLACE, known_building
+from benchmark.explore import is_within, mean_speed
+from benchmark.institute_drives import AT_PLACE, known_building
 from benchmark.institute_maps import LASER, PEOPLE, chart_map, scenario_of
 from benchmark.live import PROCESSES
-from benchmark.report import Report, Requirement, table
+from benchmark.report import Columns, Report, Requirement, mean, table_of
 from benchmark.running_nodes import Listener, Parameters
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings, chosen_seeds
@@ -43,30 +43,30 @@ SEEDS = 2
 """Buildings."""
 
 PER_BUILDING = 4
-"""Errands in each of them."""
+"""Tasks in each of them."""
 
 _EXPLORATION = 2000.0  # s, of the simulation
 _SPEED = 0.31  # m/s, paper, table 2
-_FROM, _TO = 10.0, 200.0  # s of the scripted drive, where the robot may wake up
-_START = 0.1  # m, of initialpose
+_FROM, _TO = 10.0, 200.0  # s of the scripted drive, between which the robot may start
+_START = 0.1  # largest error of initialpose, m
 
 POLICY = (
     f"Nodes as processes over DDS, {PEOPLE} people, a laser that sees all around. The map is the explorer's. At "
-    f"another visit the robot wakes up at a random place of a hallway, and is sent to {PER_BUILDING} rooms, one after "
-    "the other, drawn by chance. Reached: the pilot says that the robot is there, and it is within "
-    f"{AT_PLACE:g} m of where it truly was when it took the keyframe that stands for the room. initialpose: what the "
-    "pilot tells slam before doors, against the true pose then. A contact is counted where a step would bring the "
-    "robot's disc into a surface or a person."
+    "another visit the robot starts at a random pose in a hallway, without an initial pose, and is sent to "
+    f"{PER_BUILDING} random rooms, one after the other. Reached: the pilot reports that the robot arrived, and it is "
+    f"within {AT_PLACE:g} m of its true pose at the keyframe of the room. initialpose: the pose that the pilot sends to "
+    "slam before doors, against the true pose. A contact is a step that would bring the robot's disc into a surface or "
+    "a person."
 )
 
 RATE = 2.0
-"""Times real time at most; the robot waits for slam."""
+"""Largest speed relative to real time; the robot waits for slam."""
 
-_TIMEOUT = 900.0  # s, for an errand, and a node that compiles
+_TIMEOUT = 900.0  # s, for a task, and a node that compiles
 
 
 class ExploredBuilding(NamedTuple):
-    """A building and its saved map.
+    """An explored building with its saved map.
 
     :ivar seed: of the building.
     :ivar folder: of the map.
@@ -81,12 +81,12 @@ class ExploredBuilding(NamedTuple):
 
 
 class TaskScore(NamedTuple):
-    """An errand.
+    """The scores of a task.
 
     :ivar seed: of the building.
-    :ivar run: what happened.
+    :ivar run: of the task.
     :ivar error: distance from the room's place at the end, m.
-    :ivar starts: errors of what slam was told, m and rad.
+    :ivar starts: errors of the initial poses for slam, m and rad.
     """
 
     seed: int
@@ -96,7 +96,7 @@ class TaskScore(NamedTuple):
 
     @property
     def reached(self) -> bool:
-        """Whether the robot is there, as the pilot says."""
+        """Whether the pilot reports arrival, and the robot is at the place."""
         return self.run.text.endswith(": the robot is there") and self.error <= AT_PLACE
 
 
@@ -108,21 +108,21 @@ def measure_pilot(settings: Settings) -> Report:
     with ProcessPoolExecutor(settings.records.jobs) as pool:
         buildings = list(pool.map(explore, seeds))
     scores = [score for building in buildings for score in run_tasks(building)]
-    report = Report("pilot", "Errands of the pilot through nodes", seeds=seeds)
+    report = Report("pilot", "Tasks of the pilot through nodes", seeds=seeds)
     report.requirements = requirements(scores)
-    report.body += [_table(scores), POLICY]
+    report.body += [table_of(_COLUMNS, scores), POLICY]
     return report
 
 
 def explore_building(seed: int, configuration: Configuration, out: Path) -> ExploredBuilding:
-    """Let the explorer explore a building, and save its map.
+    """Explore a building, and save its map.
 
-    :param out: where the folder of the map is made.
-    :raises HmtSlamError: where it comes to no end.
+    :param out: folder in which that of the map is created.
+    :raises HmtSlamError: where the exploration does not end.
     """
     run = DrivenRun(DrivenRobot(scenario_of(seed)), configuration, Explorer(configuration))
     if run.run_task(Task("explore"), _EXPLORATION) is None:
-        raise HmtSlamError(f"the explorer came to no end in {_EXPLORATION:g} s: see python -m benchmark explore")
+        raise HmtSlamError(f"the explorer did not end in {_EXPLORATION:g} s: see python -m benchmark explore")
     folder = out / f"map{seed}"
     recording = run.save(folder, configuration)
     institute = chart_map(
@@ -137,7 +137,7 @@ def explore_building(seed: int, configuration: Configuration, out: Path) -> Expl
 
 
 def run_tasks(building: ExploredBuilding) -> list[TaskScore]:
-    """Send the robot to rooms drawn by chance, never twice in a row to the same."""
+    """Send the robot to random rooms, each different from the one before."""
     draw = np.random.default_rng([building.seed, 3])
     world = f"sim:institute,seed={building.seed},visit=1,changed=0,laps=1,people={PEOPLE},{LASER}"
     scored: list[TaskScore] = []
@@ -153,7 +153,7 @@ def run_tasks(building: ExploredBuilding) -> list[TaskScore]:
 
 
 def _draw_start(world: str, draw: np.random.Generator) -> float:
-    """Seconds from the beginning of the scripted drive to a time at which the robot is in a hallway."""
+    """A random time at which the robot is in a hallway, s from the beginning of the scripted drive."""
     simulated = open_simulated(world)
     inside = True
     while inside:
@@ -164,7 +164,7 @@ def _draw_start(world: str, draw: np.random.Generator) -> float:
 
 
 def _score_task(building: ExploredBuilding, run: TaskRun, room: str) -> TaskScore:
-    """An errand against what is true."""
+    """Score a task by the truth."""
     area, place = building.rooms[room]
     in_map, in_world = building.frames[area]
     starts = []
@@ -175,47 +175,35 @@ def _score_task(building: ExploredBuilding, run: TaskRun, room: str) -> TaskScor
 
 
 def requirements(scores: Sequence[TaskScore]) -> list[Requirement]:
-    """What is asked of errands."""
-    starts = [error for score in scores for error, _ in score.starts]
-    distance, seconds = sum(score.run.distance for score in scores), sum(score.run.seconds for score in scores)
-    start_requirements = [Requirement("initialpose: largest error", max(starts), _START, "m")] if starts else []
+    """Requirements on tasks of the pilot."""
+    starts = [off for score in scores for off, _ in score.starts]
+    speed = mean_speed([score.run.distance for score in scores], [score.run.seconds for score in scores])
     return [
-        Requirement(
-            "errands that reach their place", float(np.mean([score.reached for score in scores])), 1.0, least=1.0
-        ),
+        Requirement("tasks that reach their place", mean([score.reached for score in scores]), 1.0, least=1.0),
         Requirement("contacts", float(sum(score.run.contacts for score in scores)), 0.0),
-        Requirement("mean speed", distance / max(1e-9, seconds), math.inf, "m/s", least=_SPEED),
-        *start_requirements,
+        Requirement("mean speed", speed, math.inf, "m/s", least=_SPEED),
+        *([Requirement("initialpose: largest error", max(starts), _START, "m")] if starts else []),
     ]
 
 
-def _table(scores: Sequence[TaskScore]) -> str:
-    head = ["building", "errand", "how it ended", "off [m]", "way [m]", "time [s]", "contacts"]
-    head += ["initialpose off [m]", "[deg]"]
-    return table(head, [_task_row(score) for score in scores])
-
-
-def _task_row(score: TaskScore) -> list[str]:
-    task, _, result = score.run.text.partition(": ")
-    far, turned = (max((start[k] for start in score.starts), default=math.nan) for k in (0, 1))
-    start_errors = [f"{far:.2f}", f"{math.degrees(turned):.1f}"] if score.starts else ["-", "-"]
-    return [
-        str(score.seed),
-        task,
-        result,
-        f"{score.error:.2f}",
-        f"{score.run.distance:.0f}",
-        f"{score.run.seconds:.0f}",
-        str(score.run.contacts),
-        *start_errors,
-    ]
+_COLUMNS: Columns[TaskScore] = [
+    ("building", lambda score: str(score.seed)),
+    ("task", lambda score: score.run.text.partition(": ")[0]),
+    ("result", lambda score: score.run.text.partition(": ")[2]),
+    ("off [m]", lambda score: f"{score.error:.2f}"),
+    ("distance [m]", lambda score: f"{score.run.distance:.0f}"),
+    ("time [s]", lambda score: f"{score.run.seconds:.0f}"),
+    ("contacts", lambda score: str(score.run.contacts)),
+    ("initialpose off [m]", lambda score: f"{max(off for off, _ in score.starts):.2f}" if score.starts else "-"),
+    ("[deg]", lambda score: f"{math.degrees(max(turn for _, turn in score.starts)):.1f}" if score.starts else "-"),
+]
 
 
 class Start(NamedTuple):
-    """With what the nodes begin.
+    """The initial state of the nodes.
 
     :ivar world: ``sim:WORLD,...``.
-    :ivar seconds: from the beginning of its scripted drive until the robot wakes up.
+    :ivar seconds: from the beginning of its scripted drive to the start of the robot.
     :ivar folder: of the map.
     """
 
@@ -225,13 +213,13 @@ class Start(NamedTuple):
 
 
 class TaskRun(NamedTuple):
-    """What came of an errand.
+    """The record of a task.
 
-    :ivar text: how the pilot says that it ended.
-    :ivar path: shape (n, 2), where the robot truly was, m.
-    :ivar seconds: of the simulation.
-    :ivar contacts: how often the robot came upon something.
-    :ivar starts: what slam was told, ``map_T_base``, and ``world_T_base`` then, each (3,).
+    :ivar text: the pilot's result.
+    :ivar path: shape (n, 2), true positions of the robot, m.
+    :ivar seconds: simulated time, s.
+    :ivar contacts: number of contacts.
+    :ivar starts: initial poses for slam, ``map_T_base``, with the true ``world_T_base``, each (3,).
     """
 
     text: str
@@ -242,15 +230,15 @@ class TaskRun(NamedTuple):
 
     @property
     def distance(self) -> float:
-        """Way of the robot."""
+        """Path length of the robot, m."""
         return float(np.hypot(*np.diff(self.path, axis=0).T).sum())
 
 
 class PilotSession:
-    """The nodes, and what they say."""
+    """The running nodes with a robot, and their messages."""
 
     def __init__(self, stack: ExitStack, listener: Listener, start: Start) -> None:
-        """Start them; they end with the stack."""
+        """Start the nodes, which end with the stack."""
         self._listener = listener
         self._results: list[str] = []
         self._truths: dict[int, Float64] = {}
@@ -281,9 +269,9 @@ class PilotSession:
         listener.wait_until(lambda: bool(self._truths), _TIMEOUT)
 
     def run(self, room: str) -> TaskRun:
-        """Go to a room.
+        """Send the robot to a room.
 
-        :raises HmtSlamError: where the pilot does not say how that ended.
+        :raises HmtSlamError: where the pilot sends no result in time.
         """
         result_count, truth_count, start_count, contacts = (
             len(self._results),
@@ -294,7 +282,7 @@ class PilotSession:
         self._goal_publisher.publish(String(data=f"go {room}"))
         self._listener.wait_until(lambda: len(self._results) > result_count, _TIMEOUT)
         reports = self._reports
-        # What it counted up to the end is in the second report from now on.
+        # The second report from now on has all contacts up to the end.
         self._listener.wait_until(lambda: self._reports >= reports + 2)
         stamps = list(self._truths)[truth_count:]
         path = np.array([self._truths[stamp][:2] for stamp in stamps])
@@ -314,5 +302,5 @@ class PilotSession:
         for status in message.status:
             if status.name == "/robot":
                 self._reports += 1
-                # There are none before it drives.
+                # The value is missing before the robot drives.
                 self._contacts = next((int(value.value) for value in status.values if value.key == "contacts"), 0)

@@ -1,4 +1,4 @@
-"""Dated reports: requirements, tables, pictures, the circumstances, and the tables in docs/."""
+"""Reports: requirements, tables, pictures and circumstances, and the tables in docs/."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from benchmark.logs import ROOT
 from benchmark.runs import PARAMETERS
@@ -22,6 +25,10 @@ from hmt_slam_ros.errors import HmtSlamError
 
 _LIBRARIES = ("numpy", "scipy", "numba", "networkx", "rosbags")
 _MANY = 5  # seeds, more of which are not listed one by one
+
+Row = TypeVar("Row")
+Columns = Sequence[tuple[str, Callable[[Row], str]]]
+"""Heading of each column of a table, and the function that gives the cell of a row."""
 
 # Both change what a run costs.
 _VARIABLES = ("OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -33,10 +40,10 @@ IMAGES = ROOT / "docs" / "images"
 
 @dataclass(frozen=True)
 class Requirement:
-    """A figure that may not be larger than a bound, nor smaller than another.
+    """A figure with its bounds.
 
-    :ivar name: what is asked for.
-    :ivar value: as measured; NaN, which meets nothing, where it could not be.
+    :ivar name: what is required.
+    :ivar value: as measured; NaN, which meets no bound, if it could not be measured.
     :ivar bound: largest value that is allowed.
     :ivar unit: of both.
     :ivar least: smallest value that is allowed.
@@ -68,14 +75,14 @@ class Requirement:
 
 @dataclass
 class Report:
-    """What one measurement came to.
+    """The results of one measurement.
 
     :ivar kind: name of the measurement.
     :ivar title: headline.
     :ivar seeds: of the runs.
     :ivar requirements: in the order in which they are shown.
     :ivar body: Markdown under the requirements.
-    :ivar data: everything, for programs; what JSON knows.
+    :ivar data: all results, for JSON.
     :ivar pictures: {file name: caption}, of pictures in the report's folder.
     :ivar illustrations: file names of those that the documents show too.
     """
@@ -91,7 +98,7 @@ class Report:
 
     @property
     def met(self) -> bool:
-        """Whether all that is asked for holds."""
+        """Whether all requirements are met."""
         return all(requirement.met for requirement in self.requirements)
 
     @property
@@ -122,17 +129,35 @@ class Report:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table; the first column is of words, the others of figures."""
+    """A Markdown table with a left-aligned first column; the others are right-aligned."""
     rule = ["---", *("---:" for _ in head[1:])]
     return "\n".join("| " + " | ".join(line) + " |" for line in [head, rule, *rows])
+
+
+def table_of(columns: Columns[Row], rows: Iterable[Row]) -> str:
+    """A Markdown table with a line for each row.
+
+    :param columns: heading of each column, and the function that gives the cell of a row.
+    """
+    return table([heading for heading, _ in columns], [[cell(row) for _, cell in columns] for row in rows])
+
+
+def mean(values: Collection[float] | NDArray[np.float64]) -> float:
+    """The mean; NaN if there are no values."""
+    return float(np.mean(list(values))) if len(values) else math.nan
+
+
+def format_share(flags: Collection[bool] | NDArray[np.bool_]) -> str:
+    """The share of true flags in percent; "-" if there are none."""
+    return f"{100.0 * mean(flags):.0f} %" if len(flags) else "-"
 
 
 def _format_number(value: float, unit: str) -> str:
     return f"{value:.4g} {unit}".strip()
 
 
-def _make_json_safe(value: Any) -> Any:  # noqa: ANN401  whatever is in a report
-    """The same with None for numbers that JSON does not know."""
+def _make_json_safe(value: Any) -> Any:  # noqa: ANN401  any content of a report
+    """The same value with None for numbers that JSON does not have."""
     if isinstance(value, Mapping):
         return {str(key): _make_json_safe(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
@@ -141,7 +166,7 @@ def _make_json_safe(value: Any) -> Any:  # noqa: ANN401  whatever is in a report
 
 
 def describe_circumstances(seeds: Sequence[int], jobs: int, changes: Sequence[str]) -> dict[str, str]:
-    """Names and values, in the order in which they are shown.
+    """The circumstances of a measurement, {name: value}, in the order of the table.
 
     :param seeds: of the runs.
     :param jobs: runs at the same time.
@@ -163,19 +188,19 @@ def describe_circumstances(seeds: Sequence[int], jobs: int, changes: Sequence[st
 
 
 def summarize_circumstances(facts: Mapping[str, str]) -> str:
-    """The most important of them in one sentence."""
+    """The date, commit, machine and seeds as a sentence."""
     return f"Measured {facts['date']} at commit {facts['commit']} on {facts['machine']}; seeds {facts['seeds']}."
 
 
 def _list_seeds(seeds: Sequence[int]) -> str:
-    """The seeds, many in a row by the first and the last."""
+    """The seeds as text; a long range by its ends."""
     if len(seeds) > _MANY and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
         return f"{seeds[0]} to {seeds[-1]}"
     return ", ".join(map(str, seeds))
 
 
 def describe_commit() -> str:
-    """Short hash of the checked out commit, and whether files differ from it, documents aside."""
+    """Short hash of the checked out commit, and whether files outside of docs/ differ from it."""
     try:
         head = _run_git("rev-parse", "--short=10", "HEAD")
         return head + (
@@ -200,17 +225,17 @@ def _processor_name() -> str:
 
 
 def _memory_bytes() -> int:
-    """Bytes."""
+    """Memory of the machine, bytes."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def document_marks(kind: str) -> tuple[str, str]:
-    """The lines between which the tables of a measurement stand."""
+    """The lines that enclose the tables of a measurement in a document."""
     return f"<!-- python -m benchmark {kind} --write-docs -->", f"<!-- end of {kind} -->"
 
 
 def write_between_marks(path: Path, kind: str, text: str) -> None:
-    """Replace what stands between the marks of a measurement.
+    """Replace the text between the marks of a measurement.
 
     :raises HmtSlamError: where the marks are missing.
     """
@@ -223,7 +248,7 @@ def write_between_marks(path: Path, kind: str, text: str) -> None:
 
 
 def copy_illustrations(report: Report, out: Path) -> str:
-    """Copy the pictures of a report that belong into the documents; return the Markdown that shows them.
+    """Copy the illustrations of a report into docs/; return the Markdown that shows them.
 
     :param out: folder of the report.
     """

@@ -1,4 +1,4 @@
-"""Runs of ``hmt_slam map``, each in a process of its own, a few at a time."""
+"""Runs of ``hmt_slam map``, each in its own process, several in parallel."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,7 +24,7 @@ _TAIL = 3  # lines of a failed run that go into a message
 
 @dataclass(frozen=True)
 class Case:
-    """What is run.
+    """A run to be made.
 
     :ivar log: the log.
     :ivar seed: of all random numbers.
@@ -64,14 +64,14 @@ class Case:
 
 @dataclass(frozen=True)
 class Run:
-    """What came of a case.
+    """The outcome of a case.
 
     :ivar case: what was run.
     :ivar folder: its output folder.
     :ivar cpu_seconds: of the whole process, user and system.
     :ivar wall_seconds: likewise.
     :ivar peak_rss: likewise, bytes.
-    :ivar fault: what a failed run said last, empty for one that went well.
+    :ivar fault: last lines of the errors of a failed run, empty for a successful one.
     """
 
     case: Case
@@ -89,7 +89,7 @@ class Run:
 
 
 class Runner:
-    """Runs cases, each once, however often it is asked for.
+    """Runs cases, each at most once.
 
     :ivar folder: gets a folder for each run.
     :ivar jobs: runs at the same time.
@@ -100,7 +100,7 @@ class Runner:
         self._done: dict[Case, Run] = {}
 
     def attempts(self, cases: Sequence[Case]) -> list[Run]:
-        """The runs of some cases in their order, also of those that failed."""
+        """The runs of some cases in their order, including failed ones."""
         waiting = [case for case in dict.fromkeys(cases) if case not in self._done]
         with ThreadPoolExecutor(self.jobs) as pool:
             self._done.update(zip(waiting, pool.map(self._run, waiting), strict=True))
@@ -108,11 +108,15 @@ class Runner:
         return [replace(self._done[case], case=case) for case in cases]
 
     def runs(self, cases: Sequence[Case]) -> list[Run]:
-        """Likewise, where none may fail.
+        """The runs of some cases in their order.
 
-        :raises HmtSlamError: where one did.
+        :raises HmtSlamError: where one fails.
         """
-        return list(check_runs(self.attempts(cases)))
+        runs = self.attempts(cases)
+        for run in runs:
+            if run.fault:
+                raise HmtSlamError(f"the run {run.case.name} failed: {run.fault}")
+        return runs
 
     def _run(self, case: Case) -> Run:
         run = run_case(case, self.folder.absolute() / case.name)
@@ -120,15 +124,8 @@ class Runner:
         return run
 
 
-def check_runs(runs: Iterable[Run]) -> Iterable[Run]:
-    for run in runs:
-        if run.fault:
-            raise HmtSlamError(f"the run {run.case.name} failed, it said: {run.fault}")
-        yield run
-
-
 def run_case(case: Case, folder: Path) -> Run:
-    """Run a case in a process of its own."""
+    """Run a case in its own process."""
     result = subprocess.run(
         [sys.executable, "-m", "benchmark.measured", *case.command(folder)],
         cwd=ROOT,

@@ -1,4 +1,4 @@
-"""Scores of trajectories, against true relations or by the walls that later passes see again."""
+"""Scores of trajectories, by true relations or by the walls that later passes see again."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FINAL, ONLINE = "trajectory.tum", "trajectory_online.tum"
 
 POLICY = (
     "A relation is matched with the pose nearest in time within 0.1 s at both ends; where there is none, the nearest "
-    "pose is carried there along the raw odometry; where that is not possible either, the relation counts as missed."
+    "pose is extrapolated by the raw odometry; where that is not possible either, the relation counts as missed."
 )
 """How relations are matched, see :func:`hmt_slam_ros.evaluation.pair_errors`."""
 
@@ -30,24 +30,24 @@ WALLS_POLICY = (
     "return is 1 on a wall, 0 at 0.3 m from the nearest one and -1 in free space. A stretch is torn where a shift "
     "within 1 m and 3 degrees raises its agreement by more than 0.2, or the agreement is below 0.1."
 )
-"""How walls are judged, in short."""
+"""How walls are scored, in short."""
 
 APART = 20.0
-"""What was seen this much path ago, m, is an earlier pass."""
+"""Path length after which ground counts as an earlier pass, m."""
 
 TORN_GAIN = 0.2
-"""A stretch is torn where another place within reach raises its agreement by this much."""
+"""Gain of agreement at another place within reach, above which a stretch is torn."""
 
 TORN_AGREEMENT = 0.1
-"""A stretch that agrees less than this is torn too: the right place may be out of reach."""
+"""Agreement below which a stretch is torn, because its right place may be out of reach."""
 
-_STRETCH = 10.0  # m of path that are judged together
+_STRETCH = 10.0  # m of path that are scored together
 _SPACING = 0.25  # m of path between the scans that are used
-_RANGE = 15.0  # m to which beams are used; farther away neighbouring beams leave gaps in a wall
+_RANGE = 15.0  # m to which beams are used; farther away, adjacent beams leave gaps in a wall
 _CELL = 0.05  # m
 _NEAR = 0.3  # m from a wall at which agreement with it ends
-_SHARE = 0.2  # of a stretch's returns that have to fall on what is known, for it to be judged
-_SEARCHED = 600  # returns of a stretch that are used to look for a better place
+_SHARE = 0.2  # smallest share of a stretch's returns on known ground, for it to be scored
+_SEARCHED = 600  # returns of a stretch that are used to search for a better place
 _SHIFTS = np.linspace(-1.0, 1.0, 21)  # m
 _TURNS = np.radians(np.linspace(-3.0, 3.0, 13))
 
@@ -72,7 +72,9 @@ def score_trajectory(trajectory: StampedPoses, log: MeasuredLog) -> RelationErro
 
 
 def score_pairs(folder: Path, log: MeasuredLog, file: str = FINAL) -> PairErrors:
-    """Likewise, relation by relation."""
+    """Errors of one trajectory of an output folder, relation by relation.\n
+    :raises HmtSlamError: where the log has no true relations.
+    """
     if log.relations is None:
         raise HmtSlamError(f"the log {log.name} has no true relations: its trajectory cannot be scored")
     return pair_errors(read_tum(folder / file), log.relations, log.odometry)
@@ -90,8 +92,8 @@ class SeedMeans:
     :ivar long_max: largest error of any of these, m.
     :ivar rotation: as ``translation``, degrees.
     :ivar matched: share of the relations.
-    :ivar extrapolated: relations of a seed that needed the odometry, at most.
-    :ivar missed: relations of a seed that were missed, at most.
+    :ivar extrapolated: largest number of relations of a seed that needed the odometry.
+    :ivar missed: largest number of relations of a seed that were missed.
     """
 
     translation: float
@@ -107,7 +109,7 @@ class SeedMeans:
 
 
 def over_seeds(scores: Sequence[RelationErrors]) -> SeedMeans:
-    """Means over the seeds, one score each."""
+    """Means over the scores of the seeds."""
     means = np.array([score.overall.translation.mean for score in scores])
     return SeedMeans(
         translation=float(means.mean()),
@@ -124,22 +126,22 @@ def over_seeds(scores: Sequence[RelationErrors]) -> SeedMeans:
 
 
 def sample_deviation(values: Sequence[float]) -> float:
-    """With n - 1; 0 for a single value."""
+    """Standard deviation with n - 1 in the denominator; 0 for a single value."""
     return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """A stretch of the path, compared with the map of all that lies more than 20 m of path before it.
+    """A stretch of the path, compared with the map of the path up to 20 m before it.
 
-    The agreement is the mean over its returns, of those that fall on what the map knows: 1 on a wall, falling to 0 at
+    The agreement is the mean over its returns on known ground: 1 on a wall, falling to 0 at
     0.3 m from the nearest wall, and -1 in free space.
 
     :ivar begin: path length at which it begins, m.
-    :ivar returns: number of returns that fall on what the map knows.
-    :ivar agreement: where the trajectory puts it.
-    :ivar gain: by which another place within 1 m and 3 degrees would agree better.
-    :ivar shift: how far that place is away, m.
+    :ivar returns: number of returns on known ground.
+    :ivar agreement: at the pose of the trajectory.
+    :ivar gain: of agreement at the best place within 1 m and 3 degrees.
+    :ivar shift: distance to that place, m.
     """
 
     begin: float
@@ -150,16 +152,16 @@ class Stretch:
 
     @property
     def torn(self) -> bool:
-        """Whether it would clearly fit elsewhere, or does not fit at all."""
+        """Whether it fits much better elsewhere, or does not fit at all."""
         return self.gain > TORN_GAIN or self.agreement < TORN_AGREEMENT
 
 
 @dataclass(frozen=True)
 class Walls:
-    """How the later passes of a path fit the earlier ones.
+    """The agreement of later passes of a path with earlier ones.
 
-    :ivar stretches: those that lead over known ground.
-    :ivar new: number of stretches that lead over new ground, though there are earlier passes.
+    :ivar stretches: over known ground.
+    :ivar new: number of stretches over new ground, although there are earlier passes.
     """
 
     stretches: tuple[Stretch, ...]
@@ -167,7 +169,7 @@ class Walls:
 
     @property
     def agreement(self) -> float:
-        """Mean over all returns; NaN where nothing was seen twice."""
+        """Mean over all returns; NaN if nothing was seen twice."""
         returns = sum(stretch.returns for stretch in self.stretches)
         return sum(s.returns * s.agreement for s in self.stretches) / returns if returns else float("nan")
 
@@ -178,7 +180,7 @@ class Walls:
 
 
 def judge_walls(scans: Sequence[Scan], poses: NDArray[np.float64]) -> Walls:
-    """Compare every stretch of a path with what was seen before it.
+    """Compare every stretch of a path with the map of the path before it.
 
     :param scans: all scans of a log, in its order.
     :param poses: shape (n, 3), ``map_T_base`` of each, m and rad.
@@ -205,7 +207,7 @@ def _returns(scan: Scan) -> NDArray[np.float64]:
 
 
 class _AgreementGrid:
-    """What a return at some place says about the map of some scans."""
+    """A grid of agreement with the map of some scans, see :class:`Stretch`."""
 
     def __init__(self, scans: Sequence[Scan], poses: NDArray[np.float64]) -> None:
         image = occupancy_image(scans, poses, _CELL, _RANGE)
@@ -227,7 +229,7 @@ class _AgreementGrid:
 def _score_stretch(
     begin: float, points: NDArray[np.float64], center: NDArray[np.float64], grid: _AgreementGrid
 ) -> Stretch | None:
-    """The stretch, or None where it leads over new ground."""
+    """The scored stretch, or None over new ground."""
     here = grid.at(points)
     known = int(np.count_nonzero(here))
     if known < _SHARE * len(points) or not known:
@@ -240,7 +242,7 @@ def _score_stretch(
 
 
 def _best_place(points: NDArray[np.float64], center: NDArray[np.float64], grid: _AgreementGrid) -> tuple[float, float]:
-    """Largest sum of agreements over all places near by, and how far away it is, m."""
+    """Largest sum of agreements over all nearby places, and the distance of that place, m."""
     dx, dy = (axis.ravel() for axis in np.meshgrid(_SHIFTS, _SHIFTS, indexing="ij"))
     shifts = np.stack([dx, dy], axis=1)
     best, distance = -np.inf, 0.0

@@ -1,7 +1,4 @@
-"""Loop closures that only the belief over places proposes, in institutes that are gone round twice.
-
-And what it proposes in other worlds, where a laser sees half a circle.
-"""
+"""Loop closures that only the belief over places proposes, in two laps of institutes, and its proposals elsewhere."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmark.institute_maps import LASER, PEOPLE
-from benchmark.report import Report, Requirement, table
+from benchmark.report import Columns, Report, Requirement, table, table_of
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings, chosen_seeds
 from benchmark.simulated.truth import NEAR, TURN
@@ -33,26 +30,27 @@ SEEDS = 3
 """Buildings, each with one loop."""
 
 LIMIT = 0.5
-"""Areas are looked at whose position is this certain by the arcs, m."""
+"""Largest deviation of the position of areas that are compared by the arcs, m."""
 
 ELSEWHERE = ("office", "nested", "hall", "twins")
-"""Other worlds, with as many buildings each; and how many."""
+"""Other worlds."""
 
 ELSEWHERE_SEEDS = 2
+"""Buildings of each of them."""
 
 _LAPS = 2
 
 POLICY = (
-    f"A robot with a laser that sees all around goes round an institute {_LAPS} times by its scripted route, rooms "
-    f"included, with {PEOPLE} people about. At the end of the first lap it comes back to its first hallway, and from "
-    "there on it is in known ground: one loop a building. By the arcs only areas are looked at whose position is "
-    f"certain to {LIMIT:g} m (`tsbi.prior_limit={LIMIT:g}`), which none is on the other side of such a loop: what "
-    "closes has been proposed by landmarks, as the column without them shows. A proposal says how two areas lie to "
-    f"each other; it is right where that is true to {NEAR:g} m and {TURN:g} degrees. It is asked for one at every "
-    "cut at which an area is less certain than that, so at some before there is a loop, where all proposals are false. "
-    "A loop is closed at the first right closure that is accepted; these are judged as in `loops`. In the paper a "
-    "robot that was carried made the loops: 3 of 3 were detected, and nowhere else did two peaks move in the same way "
-    "three times. Elsewhere a laser sees half a circle, and the robot goes round as often as is usual there."
+    f"A robot with a laser that sees all around drives {_LAPS} laps of an institute on its scripted route, including "
+    f"rooms, with {PEOPLE} people. At the end of the first lap it returns to its first hallway, and stays in known "
+    "ground: one loop in each building. By the arcs, only areas whose position is certain to "
+    f"{LIMIT:g} m (`tsbi.prior_limit={LIMIT:g}`) are compared, and none is across such a loop. So all closures are "
+    "proposed by landmarks, as the column without them shows. A proposal is the relative pose of two areas; it is right "
+    f"if that is true to {NEAR:g} m and {TURN:g} degrees. One is requested at every cut at which an area is less certain "
+    "than that; before there is a loop, all proposals are false. A loop is closed at the first right closure that is "
+    "accepted; closures are scored as in `loops`. In the paper, the loops were made by a kidnapped robot: 3 of 3 were "
+    "detected, and nowhere else did two peaks move in the same way three times. Elsewhere a laser sees half a circle, "
+    "and the number of laps is the default of the world."
 )
 
 
@@ -60,7 +58,7 @@ ProposalListener = Callable[[HybridMap, AreaLoop | None, float], None]
 
 
 class Proposal(NamedTuple):
-    """What landmarks said at a cut at which they were asked.
+    """The proposal of landmarks at a cut.
 
     :ivar at: path length, m.
     :ivar error: of the proposed pose, m and degrees; None where nothing was proposed.
@@ -73,7 +71,7 @@ class Proposal(NamedTuple):
 
     @property
     def is_right(self) -> bool:
-        """Whether that is how the two areas lie."""
+        """Whether the proposed relative pose is true."""
         return self.error is not None and self.error[0] <= NEAR and self.error[1] <= TURN
 
 
@@ -89,11 +87,11 @@ class AcceptedClosure(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """What came of a drive.
+    """The proposals and closures of a drive.
 
     :ivar traveled: m.
-    :ivar begins: path lengths at which the robot came back to known ground, m.
-    :ivar proposals: at every cut at which landmarks were asked.
+    :ivar begins: path lengths at which the robot returns to known ground, m.
+    :ivar proposals: at every cut with a request for one.
     :ivar accepted: the closures.
     """
 
@@ -104,12 +102,12 @@ class Drive(NamedTuple):
 
     @property
     def made_proposals(self) -> list[Proposal]:
-        """The cuts at which something was proposed."""
+        """The proposals with a relative pose."""
         return [proposal for proposal in self.proposals if proposal.error is not None]
 
     @property
     def closing_distances(self) -> list[float]:
-        """From each loop that was closed the path from its begin to the first right closure, m."""
+        """Path from the begin of each closed loop to the first right closure, m."""
         closing_distances = (
             min(
                 (proposal.at - begin for proposal in self.accepted if proposal.is_right and proposal.at >= begin),
@@ -121,14 +119,14 @@ class Drive(NamedTuple):
 
 
 class _ReportingProposer(LoopProposer):
-    """Proposes loops, and tells which."""
+    """Proposes loops, and passes them to a listener."""
 
     def __init__(self, configuration: Configuration, views: AreaViewCache, listener: ProposalListener) -> None:
         super().__init__(configuration, views)
         self._listener = listener
 
     def propose(self, hybrid_map: HybridMap) -> AreaLoop | None:
-        """As always."""
+        """Propose a loop, and pass it to the listener."""
         begin = time.process_time()
         found = super().propose(hybrid_map)
         self._listener(hybrid_map, found, time.process_time() - begin)
@@ -136,14 +134,14 @@ class _ReportingProposer(LoopProposer):
 
 
 class _ProposalWatch(Watch):
-    """Judges proposals, too."""
+    """Watches proposals, too."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.proposals: list[Proposal] = []
 
     def branching(self, configuration: Configuration, replica: Replica) -> Branching:
-        """As always, but for who proposes loops."""
+        """As of ``Watch``, with a proposer that has a listener."""
         branching = super().branching(configuration, replica)
         evidence = branching.landmarks
         if isinstance(evidence, PlaceEvidence) and evidence.loops is not None:
@@ -160,7 +158,7 @@ class _ProposalWatch(Watch):
 
 
 def measure_threeloops(settings: Settings) -> Report:
-    """Go round with landmarks that propose loops, and without."""
+    """Drive laps with and without landmarks that propose loops."""
     seeds = chosen_seeds(settings, SEEDS)
     worlds = [(world, seed) for world in ELSEWHERE for seed in chosen_seeds(settings, ELSEWHERE_SEEDS)]
     with_proposals, without_proposals = (
@@ -178,36 +176,37 @@ def measure_threeloops(settings: Settings) -> Report:
     head = ["building", "traveled [m]", "loops", "cuts before", "proposals", "cuts behind", "proposals in all"]
     head += ["false", "closures accepted", "false", "loops closed", "after [m]", "closed without proposals"]
     report.body.append(table(head, rows))
-    rows = [_elsewhere_row(f"{world} {seed}", run) for (world, seed), run in zip(worlds, others, strict=True)]
-    head = ["elsewhere", "traveled [m]", "cuts", "s a cut, most", "proposals", "false", "closures accepted", "false"]
-    report.body += [table(head, rows), POLICY]
+    names = [f"{world} {seed}" for world, seed in worlds]
+
+    report.body += [table_of(_ELSEWHERE_COLUMNS, zip(names, others, strict=True)), POLICY]
     return report
 
 
-def requirements(with_them: Sequence[Drive], without: Sequence[Drive]) -> list[Requirement]:
-    """What is asked of drives with proposals, and of those without."""
-    false_proposals = sum(not one.is_right for own in with_them for one in own.made_proposals)
-    false_closures = sum(not one.is_right for own in with_them for one in own.accepted)
+def requirements(with_proposals: Sequence[Drive], without: Sequence[Drive]) -> list[Requirement]:
+    """Requirements on drives with proposals, and on those without."""
     return [
-        Requirement("loops closed, share", _closed_share(with_them), 1.0, least=1.0),
-        Requirement("proposals that are false", false_proposals, 0),
-        Requirement("closures accepted falsely", false_closures, 0),
+        Requirement("loops closed, share", _closed_share(with_proposals), 1.0, least=1.0),
+        *_false_requirements(with_proposals),
         Requirement("loops closed without proposals, share", _closed_share(without), 0),
     ]
 
 
-def elsewhere_requirements(drives: Sequence[Drive]) -> list[Requirement]:
-    """What is asked of drives through other worlds."""
-    false_proposals = sum(not one.is_right for own in drives for one in own.made_proposals)
-    false_closures = sum(not one.is_right for own in drives for one in own.accepted)
+def _false_requirements(drives: Sequence[Drive], prefix: str = "") -> list[Requirement]:
+    proposals = sum(not proposal.is_right for drive in drives for proposal in drive.made_proposals)
+    closures = sum(not closure.is_right for drive in drives for closure in drive.accepted)
     return [
-        Requirement("elsewhere: proposals that are false", false_proposals, 0),
-        Requirement("elsewhere: closures accepted falsely", false_closures, 0),
+        Requirement(f"{prefix}proposals that are false", proposals, 0),
+        Requirement(f"{prefix}closures accepted falsely", closures, 0),
     ]
 
 
+def elsewhere_requirements(drives: Sequence[Drive]) -> list[Requirement]:
+    """Requirements on drives through other worlds."""
+    return _false_requirements(drives, "elsewhere: ")
+
+
 def drive_laps(seed: int, building: str = "", *, changes: tuple[str, ...]) -> Drive:
-    """Go round in one building, an institute if no other is named."""
+    """Drive laps of one building, by default an institute."""
     configuration = load_configuration(PARAMETERS, [f"tsbi.prior_limit={LIMIT:g}", *changes], seed)
     log = open_simulated(f"sim:{building or f'institute,seed={seed},laps={_LAPS},people={PEOPLE},{LASER}'}")
     watch = _ProposalWatch(log, configuration)
@@ -218,37 +217,31 @@ def drive_laps(seed: int, building: str = "", *, changes: tuple[str, ...]) -> Dr
 
 
 def _closed_share(drives: Sequence[Drive]) -> float:
-    """Share of the loops."""
+    """Share of the loops that are closed."""
     return sum(len(own.closing_distances) for own in drives) / max(1, sum(len(own.begins) for own in drives))
 
 
-def _elsewhere_row(building: str, own: Drive) -> list[str]:
-    return [
-        building,
-        f"{own.traveled:.0f}",
-        str(len(own.proposals)),
-        f"{max((one.seconds for one in own.proposals), default=0.0):.2f}",
-        str(len(own.made_proposals)),
-        str(sum(not one.is_right for one in own.made_proposals)),
-        str(len(own.accepted)),
-        str(sum(not one.is_right for one in own.accepted)),
-    ]
+def _count_false(closings: Sequence[Proposal] | Sequence[AcceptedClosure]) -> str:
+    return str(sum(not closing.is_right for closing in closings))
 
 
-def _drive_row(building: str, own: Drive, without: Drive) -> list[str]:
-    before = [one for one in own.proposals if one.at < min(own.begins, default=own.traveled)]
-    return [
-        building,
-        f"{own.traveled:.0f}",
-        str(len(own.begins)),
-        str(len(before)),
-        str(sum(one.error is not None for one in before)),
-        str(len(own.proposals) - len(before)),
-        str(len(own.made_proposals)),
-        str(sum(not one.is_right for one in own.made_proposals)),
-        str(len(own.accepted)),
-        str(sum(not one.is_right for one in own.accepted)),
-        str(len(own.closing_distances)),
-        ", ".join(f"{way:.0f}" for way in own.closing_distances) or "-",
-        str(len(without.closing_distances)),
-    ]
+_ELSEWHERE_COLUMNS: Columns[tuple[str, Drive]] = [
+    ("elsewhere", lambda row: row[0]),
+    ("traveled [m]", lambda row: f"{row[1].traveled:.0f}"),
+    ("cuts", lambda row: str(len(row[1].proposals))),
+    ("s a cut, most", lambda row: f"{max((proposal.seconds for proposal in row[1].proposals), default=0.0):.2f}"),
+    ("proposals", lambda row: str(len(row[1].made_proposals))),
+    ("false", lambda row: _count_false(row[1].made_proposals)),
+    ("closures accepted", lambda row: str(len(row[1].accepted))),
+    ("false", lambda row: _count_false(row[1].accepted)),
+]
+
+
+def _drive_row(building: str, drive: Drive, without: Drive) -> list[str]:
+    before = [p for p in drive.proposals if p.at < min(drive.begins, default=drive.traveled)]
+    proposed = sum(proposal.error is not None for proposal in before)
+    counts = [len(drive.begins), len(before), proposed, len(drive.proposals) - len(before), len(drive.made_proposals)]
+    closed = [_count_false(drive.made_proposals), str(len(drive.accepted)), _count_false(drive.accepted)]
+    distances = [f"{distance:.0f}" for distance in drive.closing_distances]
+    loops = [str(len(distances)), ", ".join(distances) or "-", str(len(without.closing_distances))]
+    return [building, f"{drive.traveled:.0f}", *map(str, counts), *closed, *loops]

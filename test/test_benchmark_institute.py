@@ -5,15 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from benchmark.institute import (
-    Estimate,
-    Mission,
-    _mission_requirements,
-    _transitions,
-    open_doors,
-    recovery,
-    way_length,
-)
+from benchmark.institute import false_transitions, mission_requirements
+from benchmark.institute_drives import Estimate, Mission, open_doors, path_length, recovery
 from benchmark.institute_maps import InstituteMap, scenario_of, score_chart
 from benchmark.report import VALIDATION, document_marks
 from hmt_slam_ros.exploration.rooms import Destination
@@ -37,13 +30,13 @@ def mission(rights, confident=True):
 
 def test_what_is_required_of_missions():
     good, bad = mission([True] * 10), mission([True] * 8 + [False] * 2)
-    assert all(one.met for one in _mission_requirements([good]))
-    values = {one.name: one.value for one in _mission_requirements([good, bad])}
+    assert all(one.met for one in mission_requirements([good]))
+    values = {one.name: one.value for one in mission_requirements([good, bad])}
     assert values["missions that succeed"] == 0.5
     assert values["false estimates"] == values["confident false estimates"] == pytest.approx(0.1)
     assert values["false state transitions"] == pytest.approx(2 / 18)
-    assert _transitions([bad]) == [False] * 7 + [True] * 2
-    unsure = {one.name: one.value for one in _mission_requirements([mission([False] * 4, confident=False)])}
+    assert false_transitions([bad]) == [False] * 7 + [True] * 2
+    unsure = {one.name: one.value for one in mission_requirements([mission([False] * 4, confident=False)])}
     assert (unsure["confident false estimates"], unsure["unconfident estimates"]) == (0.0, 1.0)
 
 
@@ -78,8 +71,8 @@ def behind_door(node, pose):
 
 def test_the_shortest_way_between_two_nodes():
     charted = institute()
-    assert way_length(charted, 0, 2) == pytest.approx(10.0)
-    assert way_length(charted, 3, 0) == pytest.approx(15.0)
+    assert path_length(charted, 0, 2) == pytest.approx(10.0)
+    assert path_length(charted, 3, 0) == pytest.approx(15.0)
     assert float(se2.wrap(charted.nodes[0, 2] - charted.scenario.building.states.poses[0, 2])) == 0.0
 
 
