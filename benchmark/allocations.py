@@ -57,7 +57,7 @@ Counts = dict[str, list[int]]
 def count_allocations(packages: Sequence[str] = PACKAGES) -> Iterator[Counts]:
     """Count the allocations of every call of a kernel from Python, including the kernels that it calls.
 
-    numba counts one block for every array argument, which is subtracted. The kernels have to be compiled before, because a
+    numba counts one block for every array argument, which is subtracted. Kernels have to be compiled before, because a
     counting kernel cannot be compiled into another one.
 
     :param packages: of ``hmt_slam_ros``, whose kernels are counted.

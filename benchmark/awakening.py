@@ -62,16 +62,15 @@ _HELD, _HELD_WAY = 2.0, 10.0
 _DRAWS = 2008
 
 POLICY = (
-    "The robot wakes up at scans drawn from a log and drives on as it did, in one of two maps. That of the whole log "
-    "holds the very scans that it sees, which is easy. That of the log's first half, in simulation the first of two "
-    "laps, is of another time: the robot wakes up in the second half, where a keyframe of the first was taken within "
-    f"{_HELD:g} m all along the first {_HELD_WAY:g} m of its way; after that it may leave the map. "
-    "ACES has no such place. "
-    f"It says that it knows its place when the hypotheses in which it is not lost have a probability of {SURE:g}, and "
-    f"drives on for {_ON:g} m then, else {FAR:g} m in all. That is right within {_RIGHT:g} m and "
-    f"{math.degrees(_RIGHT_ANGLE):.0f} degrees of where the run over the whole log has this scan, relative to the "
-    "nearest keyframe of the map. A confident wrong answer is one that is off by more at any time after it was known. "
-    "In grid every place exists several times, so that only wrong answers are asked for."
+    "The robot starts at random scans of a log without an initial pose, and repeats the drive of the log in one of two "
+    "maps. The map of the whole log contains the very scans of the drive, which is easy. The map of the log's first "
+    "half (in simulation, the first of two laps) is of another time: the robot starts in the second half, if a "
+    f"keyframe of the first is within {_HELD:g} m all along the first {_HELD_WAY:g} m of its path; after that it may "
+    "leave the map. ACES has no such place. The robot is localized if the hypotheses that are not lost have a "
+    f"probability of {SURE:g}. It then drives {_ON:g} m more, else {FAR:g} m in all. Its pose is right within "
+    f"{_RIGHT:g} m and {math.degrees(_RIGHT_ANGLE):.0f} degrees of the pose of this scan in the run over the whole "
+    "log, relative to the nearest keyframe of the map. A confident wrong answer is a larger error at any time after "
+    "the localization. In grid every place exists several times, so that only wrong answers count."
 )
 
 

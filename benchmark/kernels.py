@@ -36,9 +36,9 @@ Keyframes = list[tuple[Scan, NDArray[np.float64]]]
 
 TIMES = (
     "CPU time, the least of three repetitions, with compiled kernels. A keyframe every half meter or twenty degrees of "
-    "odometry is inserted into the maps of the particles, which are a few centimeters apart; the maps are cleared every "
-    "forty keyframes, as at a change of area. Scans are simulated in an office with people, 361 beams each, by ray "
-    "casting alone and with all other steps; a laser of 10 Hz has 100 000 us for one."
+    "odometry is inserted into the maps of the particles, which are a few centimeters apart; the maps are cleared "
+    "every forty keyframes, as at a change of area. Scans are simulated in an office with people, 361 beams each, by "
+    "ray casting alone and with all other steps; a laser of 10 Hz has 100 000 us for one."
 )
 ALLOCATIONS = (
     "The whole log is mapped. The table counts the arrays that numba's runtime allocates in a call of each kernel from "

@@ -51,15 +51,14 @@ _AT = {"known": (0.55, 0.7), "unknown": (0.15, 0.25), "short": (0.2, 0.7)}
 _TO = {"known": (0.72, 0.85), "unknown": (0.3, 0.4)}
 
 POLICY = (
-    "Two rounds of each world. The robot is carried once, its odometry says nothing of it, and it is put down turned "
-    "by up to 180 degrees: in the second round to another part of it (known), in the first one to ground that it has "
-    f"not seen (unknown), or {_STEP:g} m farther on its way (short). It has noticed where it says "
-    "that it does not know its place, or is right. It is sure where hypotheses in which it is not lost have a "
-    f"probability of {SURE:g}, and right "
-    f"within {_RIGHT:g} m and {math.degrees(_RIGHT_ANGLE):.0f} degrees of where the map has the nearest keyframe of "
-    f"before, {100 * _DRIFT:g} % of the distance to that added. Errors are those of metric SLAM's trajectory at "
-    "relations within what was driven before and after. False alarms are metres on which a robot that nobody "
-    "carried says that it does not know its place. In hall and ring it may see the same where it is put, or nothing."
+    "Two rounds of each world. The robot is kidnapped once, without odometry, and turned by up to 180 degrees: in the "
+    f"second round to another part of it (known), in the first one to unmapped ground (unknown), or {_STEP:g} m "
+    "farther on its route (short). The kidnapping is noticed when the robot is not localized, or right. The robot is "
+    f"sure if hypotheses that are not lost have a probability of {SURE:g}. It is right within {_RIGHT:g} m and "
+    f"{math.degrees(_RIGHT_ANGLE):.0f} degrees of the pose by the nearest keyframe of before, with {100 * _DRIFT:g} % "
+    "of the distance to that added. Errors are those of metric SLAM's trajectory at relations within the parts before "
+    "and after. False alarms are meters on which a robot that was not kidnapped is not localized. In hall and ring the "
+    "view after the kidnapping may be the same, or empty."
 )
 
 

@@ -138,7 +138,7 @@ class World:
         return Truth(pose, np.array([width]), np.array([due]))
 
     def _next_on_line(self, end: Array, along: Array, normal: Array) -> tuple[float, bool]:
-        """Distance from the end of a wall to the next surface on its line, m, and whether that is a wall on the line."""
+        """Distance from the end of a wall to the next surface on its line, m, and whether that is a wall."""
         ends = self.building.reshape(-1, 2, 2) - end
         at, off = ends @ along, ends @ normal
         on = np.abs(off) < _ON
@@ -160,7 +160,7 @@ class World:
         return bool(((crossing_share > 0.0) & (crossing_share < 1.0)).any())
 
     def is_free(self, points: Array) -> NDArray[np.bool_]:
-        """Which points (n, 2) are on the free side of the walls, (n,): a ray from there crosses an odd number of them."""
+        """Which points (n, 2) are on the free side of the walls, (n,): rays from there cross an odd number of walls."""
         a, b = self.building[None, :, :2] - points[:, None], self.building[None, :, 2:] - points[:, None]
         # Rays have a slant that no wall has.
         turned = [part @ np.array([[_COS, -_SIN], [_SIN, _COS]]) for part in (a, b)]

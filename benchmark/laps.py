@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import multiprocessing
-import resource
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -12,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
+from benchmark.charted_run import resident_bytes
 from benchmark.logs import open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
@@ -51,14 +51,13 @@ NOISE = 0.1
 _BETWEEN = 60 * NANOSECONDS
 
 POLICY = (
-    f"One run of {LAPS} laps of each world (seed 0), and one in which a log of a real robot is played {PASSES} times: "
-    "from its end the robot is carried to its beginning, is not told where it is, and maps on until it is recognized. "
-    f"The growth is that from lap {STEADY} to the last, of a log from its first pass to the last. Areas and keyframes "
-    "are those of the most probable map. Memory is what is resident of the one OS process in which all five processes "
-    "run, libraries and kernels included, after a collection of garbage, less what is recorded: pose, stamps and costs "
-    "of every scan, some 200 bytes, which are the output and which none of the five keeps. The cost of a scan is CPU "
-    "time of the processes. Errors are those of metric SLAM's "
-    "trajectory in the map at the end, before the final refinement, at relations within the lap."
+    f"One run of {LAPS} laps of each world (seed 0), and one in which a real log is played {PASSES} times. At the end "
+    "of each pass the robot is put at the beginning without an initial pose, and maps on until it is relocalized. The "
+    f"growth is that from lap {STEADY} to the last, of a log from its first pass to the last. Areas and keyframes are "
+    "those of the most probable map. Memory is the resident memory of the one OS process with all five processes, "
+    "libraries and kernels, after a garbage collection. The recorded poses, stamps and costs of every scan, some 200 "
+    "bytes for the output, are subtracted. The cost of a scan is CPU time of the processes. Errors are those of metric "
+    "SLAM's trajectory in the final map, before the final refinement, at relations within the lap."
 )
 
 
@@ -182,14 +181,8 @@ def _measure_lap(run: LockStepRun, seconds: float) -> Lap:
     hybrid_map, scans = replica.maps[replica.best_hypothesis], replica.scans
     areas = hybrid_map.area_ids()
     keyframes = sum(len(hybrid_map.keyframes(area)) for area in areas)
-    memory = (scan_bytes(scans.values()), _resident(), run.recorded_bytes)
+    memory = (scan_bytes(scans.values()), resident_bytes(), run.recorded_bytes)
     return Lap(len(areas), keyframes, len(scans), *memory, len(replica.maps), 1e3 * seconds)
-
-
-def _resident() -> int:
-    """Memory of this OS process, bytes."""
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    return pages * resource.getpagesize()
 
 
 def _lap_errors(run: LockStepRun, log: Log, known: Relations | None, ends: Sequence[int]) -> Iterator[float]:

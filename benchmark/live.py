@@ -55,12 +55,11 @@ LATER = 1.1
 _TIMEOUT = 3600.0
 
 POLICY = (
-    f"Every node is a process of its own, and messages go over DDS. Saturated: a drive of {SECONDS:.0f} s with 100 "
-    "odometry readings a second in real time, and beside the nodes as many processes as the machine has cores that do "
-    "nothing but compute. The latency is the time from when the odometry message is published until its pose is, by "
-    f"the time stamps of DDS. Fast laser: {SECONDS:.0f} s with 40 scans a second of 1080 beams; the delay is that from "
-    f"a scan to metric SLAM's estimate of its pose. Replays: the logs at {RATE:g} times real time, paced, so that the "
-    "robot waits where 20 scans are without an answer."
+    f"Every node is an OS process, and messages go over DDS. Saturated: a drive of {SECONDS:.0f} s with 100 odometry "
+    "readings a second in real time, with one process for every core that only computes. The latency is the time from "
+    "the publication of an odometry message to that of its pose, by the time stamps of DDS. Fast laser: "
+    f"{SECONDS:.0f} s with 40 scans a second of 1080 beams; the delay is that from a scan to metric SLAM's estimate. "
+    f"Replays: the logs at {RATE:g} times real time with flow control: the robot waits while 20 scans have no answer."
 )
 
 Stamped = dict[int, float]

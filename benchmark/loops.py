@@ -17,16 +17,16 @@ MISSED = 0.05
 """Largest share of missed loops among those that could be closed."""
 
 POLICY = (
-    f"A closure is true if two keyframes of the areas that it joins truly are within {(1.0 + TOLERANCE) * RADIUS:g} m and "
-    f"in sight of each other, and their relative pose is right to {NEAR:g} m (to {FAR:g} m if the arc's covariance "
+    f"A closure is true if two keyframes of the areas that it joins truly are within {(1.0 + TOLERANCE) * RADIUS:g} m "
+    f"and in sight of each other, and their relative pose is right to {NEAR:g} m (to {FAR:g} m if the arc's covariance "
     f"admits the error at 99.9 %) and {TURN:g} degrees. The relative pose is that of the two keyframes that truly are "
     "nearest to each other. Every closure that TLCA accepts is scored, including those of known poses, and those that "
-    "enter a known area over a known arc. A loop begins when the robot, after "
-    f"{AWAY:g} m of new ground, comes to the place of a keyframe of {OLD:g} m of path before. It can be closed if "
-    f"the definite map had not joined the two places, the robot stays on known ground for {STAY:g} m at least, and "
-    f"half of the keyframes of the first ten meters share {100.0 * VIEW:.0f} % of their view with an earlier keyframe. "
-    f"It is closed in time if the definite map joins the two places before {GRACE:g} m beyond the known ground; the "
-    "distance is the path from the loop's begin to that."
+    f"enter a known area over a known arc. A loop begins when the robot, after {AWAY:g} m of new ground, comes to the "
+    f"place of a keyframe of {OLD:g} m of path before. It can be closed if the definite map had not joined the two "
+    f"places, the robot stays on known ground for {STAY:g} m at least, and half of the keyframes of the first ten "
+    f"meters share {100.0 * VIEW:.0f} % of their view with an earlier keyframe. It is closed in time if the definite "
+    f"map joins the two places before {GRACE:g} m beyond the known ground; the distance is the path from the loop's "
+    "begin to that."
 )
 
 WORLDS = ("nested",)
@@ -35,8 +35,8 @@ INEXACT = 0.05
 """Largest share of runs that end with another topology."""
 
 TOPOLOGY_POLICY = (
-    "A run ends with the exact topology if no closure in its most probable map is false, none was accepted falsely, and "
-    "every loop that can be closed is closed at the end, as defined for the closures above."
+    "A run ends with the exact topology if no closure in its most probable map is false, none was accepted falsely, "
+    "and every loop that can be closed is closed at the end, as defined for the closures above."
 )
 
 

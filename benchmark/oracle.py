@@ -50,37 +50,37 @@ HYPOTHESES = (1, 2, 4, 8, 16, 32)
 SEEDS, VISITS = 2, 8
 
 LIMIT = 0.05
-"""Largest mean distance at the number of hypotheses of the parameter file."""
+"""Largest mean distance with the number of hypotheses of the parameter file."""
 
 _KEYFRAMES = 6  # of a visit
 _EQUAL = 1e-6  # distances that differ by less are the same
 
 POLICY = (
     f"Drives of {VISITS} area visits, each of {_KEYFRAMES} keyframes at equal distances along the whole route; between "
-    "keyframes dead reckoning errs by 2 cm and half a degree, times the noise. Nothing is accepted on the way, and "
-    "known ground is looked for at cuts only (tsbi.recheck_keyframes is out of reach). The enumeration compares the "
-    "keyframes with every known area that the arcs do not rule out altogether, looks for ways to fit in all but 1e-9 "
-    "of the prior, and follows all of them down to a probability of 1e-9. Shared with TSBI are the transition model, "
-    "the likelihoods, and what a choice does to the map. Total variation distance of the distributions over the areas "
-    "of all visits so far, after every cut from the first one on at which a known area was possible; what TSBI did not "
-    "examine or dropped counts as wrong. Where scans tell little (tsbi.temper 0.03), many topologies stay alive and "
-    "the reduction has to choose. With odometry that errs by 8 cm and 2 degrees in 1 to 3 m nothing is required: "
-    "corridors that are alike fit so well that the enumeration believes in poses five deviations off, which the gate "
-    "on the prior (tsbi.gate_probability) keeps out on purpose, and topologies of 1e-9 come back."
+    "keyframes dead reckoning errs by 2 cm and half a degree, times the noise. No hypothesis is accepted, and "
+    "candidates in known ground are searched at cuts only (tsbi.recheck_keyframes is out of reach). The enumeration "
+    "compares the keyframes with every known area that the arcs do not exclude, searches modes in all but 1e-9 of the "
+    "prior, and keeps all of them down to a probability of 1e-9. It shares with TSBI the transition model, the "
+    "likelihoods, and the changes of the map. The figure is the total variation distance of the distributions over the "
+    "areas of all visits, after every cut from the first one on at which a known area was possible. Unexamined and "
+    "dropped hypotheses of TSBI count as wrong. With uninformative scans (tsbi.temper 0.03), many topologies stay "
+    "alive and the reduction has to choose. With odometry that errs by 8 cm and 2 degrees in 1 to 3 m there are no "
+    "requirements: similar corridors fit so well that the enumeration keeps poses five deviations off. The gate on the "
+    "prior (tsbi.gate_probability) excludes these on purpose, and topologies of 1e-9 become probable again."
 )
 
 Visits = tuple[int, ...]
-"""The area of every visit, named by the visit in which it was entered first."""
+"""The area of every visit, named by its first visit."""
 
 NEGLIGIBLE = 1e-9
-"""Probability below which a topology is not followed any further."""
+"""Probability below which a topology is dropped."""
 
 _EVERYWHERE = 1.0 - 1e-9  # share of the prior in which poses are searched for
 _DPI = 110
 
 
 class Regime(NamedTuple):
-    """Under what is compared.
+    """The conditions of a comparison.
 
     :ivar name: for the tables.
     :ivar worlds: names of ``WORLDS``.
@@ -98,7 +98,7 @@ class Regime(NamedTuple):
 
 REGIMES = (
     Regime("as it is", tuple(WORLDS), (1.0, 2.0, 3.0)),
-    Regime("scans tell little", ("ring", "four crossings", "nine crossings"), (2.0, 4.0), ("tsbi.temper=0.03",)),
+    Regime("uninformative scans", ("ring", "four crossings", "nine crossings"), (2.0, 4.0), ("tsbi.temper=0.03",)),
     Regime("odometry beyond use", tuple(WORLDS), (4.0,), required=False),
 )
 
@@ -117,13 +117,13 @@ class Stop(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """What came of one drive.
+    """The scores of one drive.
 
-    :ivar regime: under what, its name.
-    :ivar world: where, its name.
+    :ivar regime: name of the regime.
+    :ivar world: name of the world.
     :ivar distances: {number of hypotheses: total variation distance after every cut that counts}.
-    :ivar topologies: how many the enumeration followed at most.
-    :ivar dropped: probability that it did not follow, at most.
+    :ivar topologies: largest number of topologies of the enumeration.
+    :ivar dropped: upper bound of the probability that it dropped.
     """
 
     regime: str
@@ -210,7 +210,7 @@ def _configuration(changes: Sequence[str]) -> Configuration:
 
 
 def run_tsbi(drive: Sequence[Stop], configuration: Configuration, noise: float) -> list[dict[Visits, float]]:
-    """TSBI's PMF after every cut; the sum lacks what it did not examine or dropped."""
+    """TSBI's PMF after every cut, without unexamined and dropped probability."""
     script = Script(Tsbi(configuration), noise=noise)
     paths: dict[int, tuple[Visits, dict[int, int]]] = {FIRST_HYPOTHESIS: ((0,), {0: 0})}
     pmfs = []
@@ -231,19 +231,19 @@ def run_tsbi(drive: Sequence[Stop], configuration: Configuration, noise: float) 
 
 
 def total_variation(exact: Mapping[Visits, float], found: Mapping[Visits, float]) -> float:
-    """Total variation distance; what ``found`` lacks to 1 counts as probability of something else."""
+    """Total variation distance; what ``found`` lacks to 1 counts as another path."""
     lacking = max(0.0, 1.0 - sum(found.values()))
     return 0.5 * (lacking + sum(abs(exact.get(path, 0.0) - found.get(path, 0.0)) for path in {**exact, **found}))
 
 
 def mean_distances(drives: Sequence[Drive]) -> dict[int, float]:
-    """{number of hypotheses: mean distance over all cuts that count}, NaN where there are none."""
+    """{number of hypotheses: mean distance over all cuts that count}, NaN if there are none."""
     pooled = {n: [distance for drive in drives for distance in drive.distances[n]] for n in HYPOTHESES}
     return {n: float(np.mean(own)) if own else float("nan") for n, own in pooled.items()}
 
 
 def oracle_requirements(regime: str, means: Mapping[int, float], usual: int) -> list[Requirement]:
-    """That the distance is small, and that it falls with the number of hypotheses.
+    """Requirements on the distance, and on its decrease with the number of hypotheses.
 
     :param usual: number of hypotheses of the parameter file.
     """
@@ -262,7 +262,7 @@ def _table_row(regime: str, world: str, drives: Sequence[Drive]) -> list[str]:
 
 
 class _EverywhereSearch(ClosureSearch):
-    """Compares with all areas, by the same likelihoods."""
+    """A closure search in all areas, with the same likelihoods."""
 
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
         super().__init__(configuration, scans)
@@ -278,7 +278,7 @@ class _EverywhereSearch(ClosureSearch):
         most: int,
         only: Collection[int] = (),
     ) -> AreaComparison:
-        """As in the model, over all areas, however many they are."""
+        """Compare as ``ClosureSearch`` does, with all areas."""
         del most, only
         options = self._options
         unmatched = {
@@ -318,10 +318,10 @@ class _EverywhereSearch(ClosureSearch):
 
 @dataclass(frozen=True, eq=False)
 class _Topology:
-    """One way in which it may have been.
+    """A topology of the enumeration, with its map.
 
     :ivar path: its areas by visits.
-    :ivar named: {area: the visit in which it was entered first}.
+    :ivar named: {area: its first visit}.
     :ivar log_weight: log of its probability.
     """
 
@@ -334,15 +334,15 @@ class _Topology:
 
     @property
     def parent(self) -> Parent:
-        """The hypothesis that it is at the next event."""
+        """The parent hypothesis of the next event."""
         return Parent(FIRST_HYPOTHESIS, self.robot.area, self.hybrid_map, self.state, self.log_weight)
 
 
 class Enumeration:
     """All topologies of a drive.
 
-    :ivar dropped: probability of the topologies that were not followed any further, at most.
-    :ivar has_candidates: whether there was a known area so far that the robot could be in, by the arcs.
+    :ivar dropped: upper bound of the probability of the dropped topologies.
+    :ivar has_candidates: whether any known area was possible so far, by the arcs.
     """
 
     def __init__(self, configuration: Configuration, noise: float = 1.0) -> None:
@@ -358,11 +358,11 @@ class Enumeration:
 
     @property
     def topology_count(self) -> int:
-        """How many topologies there are now."""
+        """Current number of topologies."""
         return len(self._topologies)
 
     def keyframe(self, step: Float64, scan: Scan, cut: int = 0) -> dict[Visits, float]:
-        """One keyframe event, as of :meth:`benchmark.scripted.Script.keyframe`; the probability of every path."""
+        """Process a keyframe event as :meth:`benchmark.scripted.Script.keyframe`; return {path: probability}."""
         self._sequence += 1
         self._replica.scans[self._sequence] = scan
         self._branching.begin_event()
@@ -378,7 +378,7 @@ class Enumeration:
         return dict(pmf)
 
     def _add_keyframe(self, topology: _Topology, step: Float64) -> _Topology:
-        """After the robot stored the newest keyframe in its area."""
+        """The topology with the newest keyframe in the robot's area."""
         robot = topology.robot.move(step, self._noise)
         topology.hybrid_map.set_keyframe(self._sequence, robot.area, robot.pose.mean)
         return replace(
@@ -386,7 +386,7 @@ class Enumeration:
         )
 
     def _reweight(self, topology: _Topology, points: Float64) -> _Topology:
-        """Weighed by what the newest scan says for the known ground that the robot is in."""
+        """The topology, reweighted by the newest scan in known ground."""
         pose = topology.robot.pose.mean
         found = self._branching.reweight_by_known_ground(topology.parent, pose, points, self._sequence)
         return replace(topology, log_weight=found.log_weight)
@@ -415,9 +415,9 @@ class Enumeration:
 
 
 def plot_oracle(path: Path, distances: Mapping[str, Mapping[int, float]], bound: float) -> None:
-    """Total variation distance against the number of hypotheses.
+    """Draw the total variation distance against the number of hypotheses.
 
-    :param distances: {under what: {number of hypotheses: mean distance}}.
+    :param distances: {regime: {number of hypotheses: mean distance}}.
     """
     figure = Figure(figsize=(6.0, 4.5), layout="constrained")
     axes = figure.subplots()

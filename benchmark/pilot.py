@@ -54,9 +54,9 @@ POLICY = (
     f"Nodes as processes over DDS, {PEOPLE} people, a laser that sees all around. The map is the explorer's. At "
     "another visit the robot starts at a random pose in a hallway, without an initial pose, and is sent to "
     f"{PER_BUILDING} random rooms, one after the other. Reached: the pilot reports that the robot arrived, and it is "
-    f"within {AT_PLACE:g} m of its true pose at the keyframe of the room. initialpose: the pose that the pilot sends to "
-    "slam before doors, against the true pose. A contact is a step that would bring the robot's disc into a surface or "
-    "a person."
+    f"within {AT_PLACE:g} m of its true pose at the keyframe of the room. initialpose: the pose that the pilot sends "
+    "to slam before doors, against the true pose. A contact is a step that would bring the robot's disc into a surface "
+    "or a person."
 )
 
 RATE = 2.0

@@ -22,23 +22,23 @@ from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
 SEEDS = 5
 
 LONG_LIMIT = 1.0
-"""Largest error of a relation over more than 60 s in a map of the right topology, m: a missed loop leaves more."""
+"""Largest error of a relation over more than 60 s in a map of the right topology, m."""
 
 CLOSURE_LIMIT, CLOSURE_ANGLE = 0.5, 10.0
-"""Largest error of an arc that closed a loop and joins what is joined, m and degrees."""
+"""Largest error of an arc that closed a true loop, m and degrees."""
 
 POLICY = (
-    "The kinds are those of `benchmark/degraded_odometry.py`, drawn anew for every seed. A map has the right topology "
-    f"where every relation over more than 60 s is within {LONG_LIMIT:g} m of the truth, and every arc that closed a "
-    f"loop is within {CLOSURE_LIMIT:g} m and {CLOSURE_ANGLE:g} degrees of the run of the same seed with the odometry "
-    "as recorded, between the two keyframes of its areas that are nearest to each other there. Errors are means over "
-    "all seeds, also of the maps with a wrong topology; relations are matched as for accuracy."
+    "The kinds are those of `benchmark/degraded_odometry.py`, with random numbers of the run's seed. A map has the "
+    f"right topology if every relation over more than 60 s is within {LONG_LIMIT:g} m of the truth, and every arc that "
+    f"closed a loop is within {CLOSURE_LIMIT:g} m and {CLOSURE_ANGLE:g} degrees of the run of the same seed with the "
+    "recorded odometry, between the two keyframes of its areas that are nearest to each other there. Errors are means "
+    "over all seeds, including those with a wrong topology; relations are matched as for accuracy."
 )
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """On the topology of a run.
+    """The verdict on the topology of a run.
 
     :ivar scores: of the final trajectory; None for a run that failed.
     :ivar closures: errors of the arcs that closed a loop.
@@ -49,12 +49,12 @@ class Verdict:
 
     @property
     def wrong_closures(self) -> list[ClosureError]:
-        """The arcs that join what is not joined."""
+        """The arcs that closed a false loop."""
         return [c for c in self.closures if not (c.translation <= CLOSURE_LIMIT and c.rotation <= CLOSURE_ANGLE)]
 
     @property
     def is_right(self) -> bool:
-        """Whether no loop was missed and none closed wrongly."""
+        """Whether no loop is missed, and none is false."""
         if self.scores is None:
             return False
         return self.scores.over_60_s.translation.max <= LONG_LIMIT and not self.wrong_closures
@@ -85,7 +85,7 @@ def measure_robustness(settings: Settings) -> Report:
 
 
 def judge_run(run: Run, reference: Run) -> Verdict:
-    """Judge a run by the truth and by the run with the odometry as recorded."""
+    """The verdict on a run by the truth, and by the run with the recorded odometry."""
     if run.fault:
         return Verdict(None)
     closures = closure_errors(read_saved_map(run.folder / "hmt_map"), _true_poses(reference))
@@ -95,7 +95,7 @@ def judge_run(run: Run, reference: Run) -> Verdict:
 def _true_poses(reference: Run) -> dict[int, NDArray[np.float64]]:
     log: MeasuredLog = reference.case.log
     poses = read_tum(reference.folder / FINAL).poses
-    # The run may have been of the beginning of the log.
+    # The run may be of the beginning of the log.
     return {scan.stamp: pose for scan, pose in zip(log.scans[: len(poses)], poses, strict=True)}
 
 
@@ -122,7 +122,7 @@ def _verdict_cells(runs: Sequence[Run], verdicts: Sequence[Verdict]) -> list[str
 
 @dataclass(frozen=True)
 class ClosureError:
-    """How far an arc that closed a loop is from the truth.
+    """The error of an arc that closed a loop.
 
     :ivar areas: that it joins.
     :ivar translation: m.
@@ -137,7 +137,7 @@ class ClosureError:
 def closure_errors(saved: SavedMap, truth: Mapping[int, NDArray[np.float64]]) -> list[ClosureError]:
     """Errors of all arcs of the most probable map that closed a loop.
 
-    An arc is judged where it matters, between the two keyframes of its areas that truly are nearest to each other.
+    The error is that between the two keyframes of its areas that truly are nearest to each other.
 
     :param truth: {running stamp of a scan, ns: ``map_T_base`` (3,)}, of all scans of the log, in any one frame.
     """
@@ -159,7 +159,7 @@ def _closure_error(
 def _keyframe_poses(
     saved: SavedMap, area: int, truth: Mapping[int, NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Poses (n, 3) of an area's keyframes in the area, and in truth."""
+    """Poses (n, 3) of an area's keyframes in the area, and true ones."""
     keyframes = saved.replica.maps[saved.replica.best_hypothesis].keyframes(area)
     poses = np.array(list(keyframes.values())).reshape(-1, 3)
     return poses, np.array([truth[saved.replica.scans[keyframe].stamp] for keyframe in keyframes]).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""The nodes as processes in a domain of their own, a node that listens to them, and how long they take to start."""
+"""The nodes as OS processes in a separate domain, a node that listens to them, and their start times."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NODES = (*process_names(), "robot")
 
 
 class Listener:
-    """A node in a domain of its own, and the processes that it waits for.
+    """A node in a separate domain, which starts processes and waits for them.
 
     :ivar node: the node.
     """
@@ -62,7 +62,7 @@ class Listener:
         """Spin until a condition holds.
 
         :param timeout: s.
-        :raises HmtSlamError: where it does not for so long.
+        :raises HmtSlamError: where it does not hold in time.
         """
         deadline = time.monotonic() + timeout
         while not condition():
@@ -72,7 +72,7 @@ class Listener:
 
     @contextmanager
     def running(self, name: str, parameters: Parameters) -> Iterator[subprocess.Popen[bytes]]:
-        """A node as a process of its own, which ends with the context."""
+        """A node as an OS process, which ends with the context."""
         words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
         process = subprocess.Popen(
             [sys.executable, *node_command(name), "--ros-args", *words],
@@ -90,14 +90,14 @@ class Listener:
 
 
 class Start(NamedTuple):
-    """What a start takes: seconds on the wall, and of CPU time, which other programs of the machine do not change."""
+    """The duration of a start: wall time and CPU time, s."""
 
     wall: float
     cpu: float
 
 
 def time_until_answer(name: str) -> Start:
-    """From the start of a node's process until it answers a service call, as it does once it spins."""
+    """Time from the start of a node's process until it answers a service call."""
     with Listener() as listener, open_logs([BUNDLED]) as (log,):
         client = listener.node.create_client(ListParameters, f"{name}/list_parameters")
         begin = time.monotonic()
@@ -109,7 +109,7 @@ def time_until_answer(name: str) -> Start:
 
 
 def time_until_first_pose() -> Start:
-    """From the start of metric SLAM until it has placed the first scan, with scans waiting for it."""
+    """Time from the start of metric SLAM to the pose of the first scan, with waiting scans."""
     with Listener() as listener, open_logs([BUNDLED]) as (log,):
         estimates: list[String] = []
         listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], estimates.append, topics.CHAIN)
@@ -123,7 +123,7 @@ def time_until_first_pose() -> Start:
 
 
 def _waiting_robot(log: Path) -> Parameters:
-    """Parameters of a robot that waits for whoever listens."""
+    """Parameters of a robot that waits for its subscribers."""
     return {"log": str(log), "robot.discovery_timeout": 3600.0, "robot.rate": 0.0}
 
 

@@ -42,10 +42,10 @@ CUT_BOUNDS = {10_000: 100.0, 100_000: 1000.0}
 """Largest time of a cut, ms, by the number of areas."""
 
 STRESS = ("tsbi.prior_scale=5", "tsbi.temper=0.03")
-"""Changes under which arcs admit more areas than are looked at, and scans decide little."""
+"""Parameters under which arcs admit more areas than are compared, and scans are nearly uninformative."""
 
 GROWTH = 0.1
-"""Largest growth of what a scan costs in SLAM and RTL, from the smallest to the largest of the small maps."""
+"""Largest growth of the cost of a scan in SLAM and RTL, from the smallest to the largest of the small maps."""
 
 STORED = 20.0
 """Largest memory of a stored area, kB."""
@@ -59,24 +59,23 @@ SAVED_AND_LOADED = 5.0
 _FEW = 2  # excursions under stress
 
 POLICY = (
-    "Maps are lattices of corridors, all crossings alike, made as data: every crossing is an area of "
-    f"{PER_AREA} keyframes with arcs to the next ones, {BEAMS} beams to a scan. For the cuts a robot leaves the "
-    "lattice, goes along beside it for up to eight crossings with a new area at each, and comes back; its odometry "
-    "errs as its covariance says, and a stand-in for metric SLAM and acceptance hands TSBI its poses. A cut is timed "
-    "from the keyframe to the acceptance, CPU time of one process, under all hypotheses that are alive. Under stress "
-    f"({', '.join(STRESS)}) arcs admit far more areas than are looked at, which counts as not examined, and scans "
-    "decide little. For the scans all five processes run in a loop through known ground; CPU time a "
-    "scan, the median of the repetitions. Memory is what Python allocates: poses and arcs in each process that keeps "
-    f"the map, and the ranges of its scans, here of {STORED_BEAMS} beams; what can be computed anew from them is told, "
-    "and does not count. What is saved is the whole state of a run that mapped the lattice in one pass, under one "
-    f"hypothesis, with a scan of its own of {STORED_BEAMS} beams for every keyframe and {SCANS_PER_KEYFRAME} scans of "
-    "the log to each. Saving ends when all is on the disk of the system's folder for temporary files, loading with "
-    "processes that can go on; wall time."
+    f"Maps are synthetic lattices of corridors with equal crossings: every crossing is an area of {PER_AREA} keyframes "
+    f"with arcs to the next ones, {BEAMS} beams to a scan. For the cuts a robot leaves the lattice, drives beside it "
+    "for up to eight crossings with a new area at each, and returns. Its odometry errs by its covariance, and a "
+    "replacement of metric SLAM and acceptance gives its poses to TSBI. The time of a cut is that from the keyframe to "
+    f"the acceptance, CPU time of one process, under all live hypotheses. Under stress ({', '.join(STRESS)}) arcs "
+    "admit far more areas than are compared, which counts as unexamined, and scans are nearly uninformative. For the "
+    "scans all five processes run in a loop through known ground; CPU time of a scan, median of the repetitions. "
+    "Memory is what Python allocates: poses and arcs in each process that keeps the map, and the ranges of its scans, "
+    f"here of {STORED_BEAMS} beams. Data that can be computed from these is listed, and does not count. The saved "
+    f"state is that of a run that mapped the lattice in one pass, under one hypothesis, with a scan of {STORED_BEAMS} "
+    f"beams for every keyframe and {SCANS_PER_KEYFRAME} scans of the log to each. Saving ends with all files on the "
+    "disk of the system's temporary folder, loading with processes that can continue; wall time."
 )
 
 _EXCURSIONS = 6
 _LONGEST = 8  # crossings along the map
-_SMALL = 1000  # maps of at most so many areas are made anew for every excursion
+_SMALL = 1000  # largest number of areas of a map that is made for every excursion
 _REPEATS = 5
 _STEP, _TURN = 0.1, 10  # m and degrees between scans
 _PERIOD = 200_000_000  # ns
@@ -85,7 +84,7 @@ _DPI = 110
 
 
 def measure_scale(settings: Settings) -> Report:
-    """Time cuts and scans, weigh a stored area."""
+    """Measure times of cuts, scans and files, and the memory of an area."""
     configuration = load_configuration(PARAMETERS, list(settings.changes))
     report = Report("scale", "Cost against the number of areas", seeds=(0,))
     cuts = {lattice.areas: measured_cuts(lattice, configuration) for lattice in (*SMALL, *LARGE)}
@@ -113,12 +112,12 @@ def measure_scale(settings: Settings) -> Report:
 
 
 def cut_requirement(areas: int, cuts: Sequence[Cut]) -> Requirement:
-    """That no cut takes longer than is asked for."""
+    """Requirement on the longest cut."""
     return Requirement(f"longest cut at {areas} areas", max(cut.ms for cut in cuts), CUT_BOUNDS[areas], "ms")
 
 
 def growth_requirement(process: str, scans: Mapping[int, Mapping[str, float]]) -> Requirement:
-    """That a scan costs the same in the largest map as in the smallest.
+    """Requirement on the growth of the cost of a scan from the smallest to the largest map.
 
     :param scans: {number of areas: {process: ms a scan}}.
     """
@@ -130,25 +129,18 @@ def growth_requirement(process: str, scans: Mapping[int, Mapping[str, float]]) -
 def _cut_table(cuts: Mapping[str, Sequence[Cut]]) -> str:
     head = ["areas", "cuts", "median [ms]", "95 %", "max", "cuts near known areas", "median [ms]", "95 %", "max"]
     head += ["areas compared at most", "hypotheses at most", "not examined at most"]
-    return table(head, [_cut_row(name, own) for name, own in cuts.items()])
-
-
-def _cut_row(name: str, cuts: Sequence[Cut]) -> list[str]:
-    near = [cut for cut in cuts if cut.compared]
-    return [
-        name,
-        str(len(cuts)),
-        *_quantiles(cuts),
-        str(len(near)),
-        *_quantiles(near),
-        str(max(cut.compared for cut in cuts)),
-        str(max(cut.hypotheses for cut in cuts)),
-        f"{max(cut.unexamined for cut in cuts):.3f}",
-    ]
+    rows = []
+    for name, own in cuts.items():
+        near = [cut for cut in own if cut.compared]
+        most = [max(getattr(cut, count) for cut in own) for count in ("compared", "hypotheses")]
+        unexamined = f"{max(cut.unexamined for cut in own):.3f}"
+        times = [name, str(len(own)), *_quantiles(own), str(len(near)), *_quantiles(near)]
+        rows.append([*times, *map(str, most), unexamined])
+    return table(head, rows)
 
 
 def _describe_bound(configuration: Configuration, cuts: Sequence[Cut]) -> str:
-    """How long a cut can take."""
+    """A sentence with the upper bound of the time of a cut."""
     options = configuration.tsbi
     most = options.max_comparisons + MIN_EXAMINED_AREAS * options.max_hypotheses
     each = max(cut.ms / cut.compared for cut in cuts if cut.compared)
@@ -175,7 +167,7 @@ def _stored_table(area: AreaMemory) -> str:
     rows: list[tuple[str, Any]] = [
         ("poses of its keyframes and arcs", area.graph),
         ("scans of its keyframes", area.scans),
-        ("their end points, kept where the area was compared", area.points),
+        ("their end points, cached if the area was compared", area.points),
     ]
     return table(["of a stored area", "memory [kB]"], [[name, f"{size:.2f}"] for name, size in rows])
 
@@ -186,12 +178,12 @@ def _lasting_table(saved: SaveTimes) -> str:
 
 
 class Cut(NamedTuple):
-    """One cut.
+    """The cost of a cut.
 
     :ivar ms: CPU time from the keyframe to the acceptance.
-    :ivar compared: known areas that the keyframes were compared with, under all hypotheses.
-    :ivar hypotheses: alive after it.
-    :ivar unexamined: probability of what was not looked at.
+    :ivar compared: number of known areas compared with the keyframes, under all hypotheses.
+    :ivar hypotheses: number of live hypotheses after it.
+    :ivar unexamined: probability that was not examined.
     """
 
     ms: float
@@ -201,7 +193,7 @@ class Cut(NamedTuple):
 
 
 class _TimedTsbi:
-    """A TSBI in a map, of which the CPU time and the comparisons are counted until they are taken."""
+    """TSBI in a map, which counts CPU time and comparisons between calls of ``take``."""
 
     def __init__(self, lattice: Lattice, configuration: Configuration) -> None:
         self._lattice = lattice
@@ -217,7 +209,7 @@ class _TimedTsbi:
         self._compared += len(examination.found.examined_areas)
 
     def handle(self, message: Message) -> list[Message]:
-        """As TSBI does."""
+        """Handle a message as TSBI."""
         begin = time.process_time()
         messages = self._tsbi.handle(message)
         self._seconds += time.process_time() - begin
@@ -231,7 +223,7 @@ class _TimedTsbi:
 
 
 def measured_cuts(lattice: Lattice, configuration: Configuration, excursions: int = _EXCURSIONS) -> list[Cut]:
-    """The cuts of some ways out of the map and back in, after one that compiles kernels and is not counted."""
+    """The cuts of some excursions out of the map, after one that compiles kernels and does not count."""
     _Robot(Lattice(5, 2), configuration).excursion(0, 0)
     cuts: list[Cut] = []
     robot = _Robot(lattice, configuration)
@@ -244,7 +236,7 @@ def measured_cuts(lattice: Lattice, configuration: Configuration, excursions: in
 
 
 class _Robot:
-    """Drives out of a lattice and back in."""
+    """A robot that drives out of a lattice and back in."""
 
     def __init__(self, lattice: Lattice, configuration: Configuration) -> None:
         self._lattice = lattice
@@ -253,7 +245,7 @@ class _Robot:
         self._poses = lattice.poses()
 
     def excursion(self, column: int, seed: int) -> list[Cut]:
-        """The cuts on the way from a crossing of row 0 along row -2 to a later crossing of row 0, and into row 1."""
+        """The cuts on a path from a crossing of row 0 along row -2 to a later crossing of row 0, and into row 1."""
         end = min(column + _LONGEST, self._lattice.columns - 1)
         way = [(column, 0), (column, -1), *((c, -2) for c in range(column, end + 1)), (end, -1), (end, 0), (end, 1)]
         self._script.go_to(column, shared_scan(0.0, 0))
@@ -273,14 +265,14 @@ class _Robot:
 
 
 class _TimedProcess:
-    """A process whose CPU time is counted."""
+    """A process that counts its CPU time."""
 
     def __init__(self, process: Process) -> None:
         self._process = process
         self.seconds = 0.0
 
     def handle(self, message: Message) -> list[Message]:
-        """As the process does."""
+        """Handle a message as the process."""
         begin = time.process_time()
         messages = self._process.handle(message)
         self.seconds += time.process_time() - begin
@@ -290,7 +282,7 @@ class _TimedProcess:
 def cost_of_scans(
     lattices: Sequence[Lattice], configuration: Configuration, repeats: int = _REPEATS
 ) -> dict[int, dict[str, float]]:
-    """{number of areas: {process: ms a scan}}, medians; the maps take turns, so that all see the same machine."""
+    """{number of areas: {process: median ms a scan}}, with the maps in turn, for the same load of the machine."""
     _scan_costs(lattices[0], configuration)
     measured = [{lattice.areas: _scan_costs(lattice, configuration) for lattice in lattices} for _ in range(repeats)]
     return {
@@ -320,7 +312,7 @@ def _scan_costs(lattice: Lattice, configuration: Configuration) -> dict[str, flo
 
 
 def _fill_replica(replica: Replica, lattice: Lattice) -> Replica:
-    """A replica that knows the map, as if its process had been there."""
+    """Fill a replica with the map, and return it."""
     replica.maps[FIRST_HYPOTHESIS] = lattice.hybrid_map()
     replica.scans = LatticeScans()
     return replica
@@ -343,11 +335,11 @@ def plot_scale(
     scans: Mapping[int, Mapping[str, float]],
     bounds: Mapping[int, float],
 ) -> None:
-    """Cost against the number of areas.
+    """Draw the cost against the number of areas.
 
     :param cuts: {number of areas: ms of each cut}.
     :param scans: {number of areas: {process: ms a scan}}.
-    :param bounds: {number of areas: ms that a cut may take}.
+    :param bounds: {number of areas: largest time of a cut, ms}.
     """
     figure = Figure(figsize=(10.0, 4.0), layout="constrained")
     left, right = figure.subplots(1, 2)

@@ -1,4 +1,4 @@
-"""Maps of many areas on disk and in memory: time to save and load, and what an area takes."""
+"""Maps of many areas on disk and in memory: times of saving and loading, and memory of an area."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from hmt_slam_ros.saved_map.folder import replace_folder
 from hmt_slam_ros.sensors import Scan
 
 BEAMS = 181
-"""Of the scans that are saved or weighed."""
+"""Beams of the scans that are saved or measured."""
 
 SCANS_PER_KEYFRAME = 10
-"""Scans of the log to each keyframe, of which the trajectory has a pose."""
+"""Scans of the log, with poses in the trajectory, for each keyframe."""
 
 _PERIOD = 100_000_000  # ns
 _DRIVE, _SECONDS = "sim:office", 20.0
@@ -43,13 +43,13 @@ Made = TypeVar("Made")
 
 
 class SaveTimes(NamedTuple):
-    """A map that was saved and loaded.
+    """Times of saving and loading a map.
 
-    :ivar areas: of it.
+    :ivar areas: number of areas.
     :ivar megabytes: of its files.
     :ivar save: s, from the running processes to the last byte on the disk.
-    :ivar load: s, from the files to processes that can go on.
-    :ivar load_map: s, from the files to the map alone, without the state.
+    :ivar load: s, from the files to processes that can continue.
+    :ivar load_map: s, from the files to the map without the state.
     """
 
     areas: int
@@ -60,12 +60,12 @@ class SaveTimes(NamedTuple):
 
     @property
     def whole(self) -> float:
-        """Saving and loading, s."""
+        """Time of saving and loading, s."""
         return self.save + self.load
 
 
 def time_saving(lattice: Lattice, configuration: Configuration) -> SaveTimes:
-    """Save and load a map of all crossings of a lattice, after a first one that loads code and is not counted."""
+    """Save and load a map of all crossings of a lattice, after a small one that loads code and does not count."""
     _time_once(Lattice(5, 2), configuration)
     return _time_once(lattice, configuration)
 
@@ -95,7 +95,7 @@ def _time_once(lattice: Lattice, configuration: Configuration) -> SaveTimes:
 
 
 def state_of(lattice: Lattice, configuration: Configuration) -> RunState:
-    """The state of a run that mapped all crossings of a lattice, each by a way of its own through it.
+    """The state of a run that mapped all crossings of a lattice, each by a separate path.
 
     The particle filter is that of a drive through a simulated building.
     """
@@ -143,7 +143,7 @@ def _drive_state(configuration: Configuration) -> RunState:
 
 
 def _own_scan(scan: Scan, keyframe: int) -> Scan:
-    """A scan of a keyframe's own, of ``BEAMS`` beams."""
+    """A distinct scan of a keyframe, of ``BEAMS`` beams."""
     ranges = np.resize(scan.ranges, BEAMS) + np.float32(1e-6 * (keyframe - FIRST_KEYFRAME))
     return replace(scan, stamp=_stamp(keyframe), ranges=ranges)
 
@@ -153,13 +153,13 @@ def _stamp(keyframe: int) -> int:
 
 
 def _log_state(keyframes: Sequence[int]) -> LogProgress:
-    """A log with a reading of the odometry to each scan."""
+    """The progress of a log with an odometry reading for each scan."""
     stamps = _stamp(keyframes[0]) + _PERIOD * np.arange(len(keyframes) * SCANS_PER_KEYFRAME)
     return LogProgress(2 * stamps.size, stamps, stamps)
 
 
 def _recorder_fields(keyframes: Sequence[int]) -> dict[str, Any]:
-    """What the recorder keeps of all scans and of the events, a keyframe each."""
+    """Fields of the recorder for all scans, and for events with a keyframe each."""
     scans = np.arange(len(keyframes) * SCANS_PER_KEYFRAME)
     stamps, poses = _stamp(keyframes[0]) + _PERIOD * scans, np.zeros((scans.size, 3))
     each = zip(np.split(scans, len(keyframes)), np.split(stamps, len(keyframes)), keyframes, strict=True)
@@ -184,7 +184,7 @@ class AreaMemory(NamedTuple):
 
     :ivar graph: poses of its keyframes and its arcs.
     :ivar scans: the scans of its keyframes, as received.
-    :ivar points: their end points, where something asked for them.
+    :ivar points: their end points, if they were computed.
     """
 
     graph: float
@@ -193,12 +193,12 @@ class AreaMemory(NamedTuple):
 
     @property
     def whole(self) -> float:
-        """What cannot be built anew from the rest, kB."""
+        """Memory of all data that cannot be computed from other data, kB."""
         return self.graph + self.scans
 
 
 def weigh_areas(lattice: Lattice) -> AreaMemory:
-    """Weigh the areas of a lattice, each with its own scans."""
+    """Measure the memory of the areas of a lattice, each with distinct scans."""
     graph = _measure_memory(lattice.hybrid_map)[0] / lattice.areas
     _make_scan(0)
     scans, kept = _measure_memory(lambda: [_make_scan(keyframe) for keyframe in range(_AREAS_OF_SCANS * PER_AREA)])
@@ -211,7 +211,7 @@ def _make_scan(keyframe: int) -> Scan:
 
 
 def _measure_memory(make: Callable[[], Made]) -> tuple[float, Made]:
-    """What something takes, kB, and the thing itself."""
+    """The memory of a value, kB, and the value."""
     tracemalloc.start()
     try:
         made = make()

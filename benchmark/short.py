@@ -7,7 +7,7 @@ it was written with. The mean over the few seeds of the short form may exceed th
 
 that is by four standard errors of the difference of two such means: with ten seeds, one false alarm in about 600
 figures (Student, 9 degrees of freedom). The 2 % are for figures that hardly depend on the seed. A change for the
-better, or for the worse on purpose, is put on record with ``python -m benchmark short --write-expected``.
+better, or for the worse on purpose, is recorded with ``python -m benchmark short --write-expected``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SMALLEST_MARGIN = 0.02
 
 @dataclass(frozen=True)
 class Part:
-    """What of a log is run.
+    """The part of a log that is run.
 
     :ivar log: its name.
     :ivar duration: seconds of it, 0 for all.
@@ -71,7 +71,7 @@ Figures = dict[str, list[float]]
 
 
 def measure_short(settings: Settings) -> Report:
-    """Run the parts whose logs are there, and compare with what is expected, or write what is to be expected."""
+    """Run the parts whose logs are there, and compare the figures with expected ones, or record them."""
     report = Report("short", "Has accuracy become worse?", seeds=tuple(range(max(part.seeds for part in PARTS))))
     figures = _measure_parts(settings, report)
     if settings.write_expected:
@@ -88,7 +88,7 @@ def measure_short(settings: Settings) -> Report:
 def _measure_parts(settings: Settings, report: Report) -> dict[str, Figures]:
     reasons = {part.log: reason_missing(part.log) for part in PARTS}
     if settings.write_expected and any(reasons.values()):
-        raise HmtSlamError(f"not all that is expected can be measured: {next(filter(None, reasons.values()))}")
+        raise HmtSlamError(f"not all expected figures can be measured: {next(filter(None, reasons.values()))}")
     report.body += [f"Skipped {log}: {reason}." for log, reason in reasons.items() if reason]
     parts = [part for part in PARTS if not reasons[part.log]]
     with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder, open_logs([p.log for p in parts]) as logs:
@@ -100,7 +100,7 @@ def _measure_parts(settings: Settings, report: Report) -> dict[str, Figures]:
             ]
             for part, log in zip(parts, logs, strict=True)
         }
-        # All at once, so that no core waits for the last run of a log.
+        # All cases are run together, so that no core waits for the last run of a log.
         runner.runs([case for own in cases.values() for case in own])
         report.body.append(_cost_table(runs := {log: runner.runs(own) for log, own in cases.items()}))
         return {log.name: figures_of(log, own) for log, own in runs.items()}
@@ -119,7 +119,7 @@ def figures_of(log: MeasuredLog, runs: Sequence[Run]) -> Figures:
 
 def _relation_figures(log: MeasuredLog, run: Run) -> dict[str, float]:
     assert log.relations is not None
-    # Without the odometry: what lies beyond the part of the log that was run has to be missed.
+    # Without odometry, relations beyond the part of the log count as missed.
     final, online = (evaluate_relations(read_tum(run.folder / file), log.relations) for file in (FINAL, ONLINE))
     return {
         "translation_m": final.overall.translation.mean,
@@ -143,13 +143,13 @@ def _wall_figures(log: MeasuredLog, run: Run) -> dict[str, float]:
 def regressions(log: str, figures: Figures, expected: Mapping[str, Expected]) -> list[Requirement]:
     """Each figure's mean over the seeds, and its bound.
 
-    :raises HmtSlamError: for a figure of which nothing is expected.
+    :raises HmtSlamError: for a figure without an expected value.
     """
     unknown = sorted(figures.keys() ^ expected.keys())
     if unknown:
         raise HmtSlamError(
             f"{EXPECTED.name} and the figures of {log} differ in {unknown[0]}: run 'python -m benchmark short "
-            "--write-expected' and look at what it changes"
+            "--write-expected' and check the changes"
         )
     requirements = []
     for name, values in figures.items():
@@ -160,7 +160,7 @@ def regressions(log: str, figures: Figures, expected: Mapping[str, Expected]) ->
 
 
 def read_expected(path: Path) -> dict[str, dict[str, Expected]]:
-    """{log: {figure: what is expected}}.
+    """{log: {figure: expected values}}.
 
     :raises HmtSlamError: where there is no such file.
     """

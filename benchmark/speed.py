@@ -37,19 +37,19 @@ _REPEATS = 5
 Measured = TypeVar("Measured")
 
 POLICY = (
-    "One run at a time, each a process of its own, after one run of every log that compiles what is not in the cache "
-    "and is not counted. CPU time is user and system time of the whole process with all it starts, from its start to "
-    "its exit, with reading the log and writing the folder; memory is the largest resident set. A scan's cost is wall "
-    "time; its mean, its 95 % quantile and its maximum are over all scans of a log, and the mean of the first two and "
-    "the maximum of the third are over the seeds. Start times are medians of five; where other programs keep the "
-    "machine busy, DDS may miss the first announcement of a node, which adds 3 s on the wall."
+    "One run at a time, each an OS process, after one run of every log that compiles missing kernels and does not "
+    "count. CPU time is user and system time of the process and its children, from start to exit, including reading "
+    "the log and writing the folder; memory is the largest resident set. A scan's cost is wall time; its mean, its 95 "
+    "% quantile and its maximum are over all scans of a log. The mean of the first two and the maximum of the third "
+    "are over the seeds. Start times are medians of five; on a busy machine DDS may miss the first announcement of a "
+    "node, which adds 3 s of wall time."
 )
 
 
 def measure_speed(settings: Settings) -> Report:
     """Run every log alone with every seed, and start every program."""
     seeds = settings.seeds_or(SEEDS)
-    report = Report("speed", "What a run costs", seeds=seeds)
+    report = Report("speed", "The cost of a run", seeds=seeds)
     runner = Runner(settings.out / "runs_for_speed", jobs=1)
     with open_logs(settings.logs_or(WITH_RELATIONS)) as logs:
         with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder:
@@ -79,7 +79,7 @@ def _report_runs(report: Report, runs: dict[str, list[Run]]) -> None:
 
 
 def speed_requirements(name: str, cpu_seconds: Sequence[float], peak_rss: Sequence[int]) -> list[Requirement]:
-    """What is asked for of the runs of a log; nothing where it has no bound.
+    """Requirements on the runs of a log, none without a bound.
 
     :param cpu_seconds: of each run.
     :param peak_rss: of each run, bytes.
@@ -124,7 +124,7 @@ def _memory_tables(runs: dict[str, list[Run]]) -> list[str]:
     rows = [[name, part, f"{size / 1e6:.1f}"] for name, sizes in parts.items() for part, size in (sizes or {}).items()]
     absent = [name for name, sizes in parts.items() if not sizes]
     tables = [table(["log", "part", "memory [MB]"], rows)] if rows else []
-    return tables + ([f"The reports of {', '.join(absent)} do not tell memory by part."] if absent else [])
+    return tables + ([f"The reports of {', '.join(absent)} have no memory by part."] if absent else [])
 
 
 def _report_starts(report: Report) -> None:
@@ -156,6 +156,6 @@ def _node_starts(report: Report) -> list[list[str]]:
 
 
 def _repeat(measure: Callable[[], Measured]) -> list[Measured]:
-    """A few repetitions, after one that is not counted."""
+    """Some repetitions, after one that does not count."""
     measure()
     return [measure() for _ in range(_REPEATS)]

@@ -1,4 +1,4 @@
-"""How large the package is, and how many files one scan, one keyframe and one closure pass.
+"""The size of the package, and the number of files that a scan, a keyframe and a closure pass.
 
 A function call or a return that leads from one file of the package to another is a move. The bundled log is run in
 lock-step; the figures of a scan are the median over those without a keyframe event, those of a keyframe the median over
@@ -30,11 +30,11 @@ LONGEST, MOST_LINES = 600, 36_000
 """Lines of a file, and of the package, at most."""
 
 MOST_FILES = {"scan": 14, "keyframe": 35, "closure": 50}
-"""Files that are passed, as aimed at."""
+"""Largest numbers of files that are passed."""
 
 
 class Passage(NamedTuple):
-    """What one record of the log passed.
+    """The files that a record of the log passes.
 
     :ivar kind: "scan", "keyframe" or "closure".
     :ivar files: of the package that were entered.
@@ -48,7 +48,7 @@ class Passage(NamedTuple):
 
 def measure_structure(settings: Settings) -> Report:
     """Count files, lines and classes, and follow the bundled log through them."""
-    report = Report("structure", "The size of the package, and the way of a scan through it", seeds=(0,))
+    report = Report("structure", "The size of the package, and the path of a scan through it", seeds=(0,))
     paths = sorted(PACKAGE.rglob("*.py"))
     lines = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in paths}
     classes = Counter(name for path in paths for name in class_names(path))
@@ -87,7 +87,7 @@ def typical_passage(passages: list[Passage], kind: str) -> Passage:
 
 
 def follow_log(path: Path, changes: tuple[str, ...]) -> Iterator[Passage]:
-    """What each scan of a log passes; those before the first keyframe events are left out."""
+    """The passage of each scan of a log after the first keyframe event."""
     run = LockStepRun(load_configuration(PARAMETERS, list(changes)))
     recorder = run.recorder
     scans, events, closures = 0, 0, 0

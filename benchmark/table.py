@@ -1,4 +1,4 @@
-"""The paper's Table II: time and memory against the same program with one area for everything, at equal accuracy."""
+"""The paper's Table II: time and memory against the same program with a single area, at equal accuracy."""
 
 from __future__ import annotations
 
@@ -43,32 +43,31 @@ from hmt_slam_ros.simulation import open_simulated
 COMPARED = ("edmonton", CAMPUS, "aces")
 
 PARTICLES = (12, 100)
-"""Of the metric filter; more are tried until it is as accurate, but 1000 take more than an hour on the campus."""
+"""Numbers of particles of the metric filter, which are tried in this order until it is as accurate."""
 
 FACTOR, SLACK = 1.25, 0.01
-"""An error is as good as another up to this factor, and up to so many m more."""
+"""Largest ratio and largest difference (m) of errors that are as good as each other."""
 
 MEMORY, TIME = 3.0, 4.0
-"""How many times as much the metric filter takes on the campus, at least."""
+"""Smallest ratios of memory and time of the metric filter on the campus."""
 
 SEEDS = 1
 
 POLICY = (
-    "HMT-SLAM is the program as it is. The metric RBPF is the same program with one area for everything: its local map "
-    "holds the whole log, area abstraction never cuts, so that no topological process has anything to do, and a loop "
-    f"is closed by particles alone. It is tried with {', '.join(map(str, PARTICLES))} particles, until its final "
-    f"trajectory is as accurate over relations of more than 60 s: up to {FACTOR:g} times the error, or {SLACK:g} m "
-    f"more, and no error above {LONG_LIMIT:g} m, beyond which a map is not right. Where none is, its figures with the "
-    "most particles are lower bounds of what it would take. One run at a time, each a process of its own, kernels "
-    "compiled before. CPU time is user and system time of the process without what reading or simulating the log "
-    "took; peak memory is the largest resident set, of which some is there before the first scan. Both runs "
-    "end with the same refinement of the trajectory, which is told, and is part of both figures. The campus is "
-    f"{CAMPUS_WORLD}, judged by the truth; ACES by its relations; Edmonton, which has no truth, by how far relations "
-    "of the trajectory are from GMapping's, which is a metric RBPF as well."
+    "HMT-SLAM is the program as it is. The metric RBPF is the same program with a single area: its local map contains "
+    "the whole log, and area abstraction never cuts. So the topological processes have nothing to do, and loops are "
+    f"closed by particles alone. It runs with {', '.join(map(str, PARTICLES))} particles, until its final trajectory "
+    f"is as accurate over relations of more than 60 s: up to {FACTOR:g} times the error, or {SLACK:g} m more, and no "
+    f"error above {LONG_LIMIT:g} m, beyond which a map is not right. If none is, its figures with the most particles "
+    "are lower bounds. One run at a time, each an OS process, with compiled kernels. CPU time is user and system time "
+    "of the process without reading or simulating the log; peak memory is the largest resident set, which includes the "
+    "memory before the first scan. Both runs end with the same refinement of the trajectory, which is listed, and part "
+    f"of both figures. The campus is {CAMPUS_WORLD}, scored by the truth; ACES by its relations; Edmonton, which has "
+    "no truth, by the distance of its relations from those of GMapping, which is a metric RBPF as well."
 )
 
 EXTENTS = {"edmonton": 100.0, CAMPUS: 200.0, "aces": 80.0}
-"""Half side of the one map of a log, m, that holds all of it."""
+"""Half of the side of a map that contains the whole log, m."""
 
 _GMAPPING = "edmonton.gmapping.txt.xz"
 _DPI = 80
@@ -98,18 +97,18 @@ class Entry:
     worst: float
 
     def as_accurate_as(self, other: Entry) -> bool:
-        """Whether its long error is as good, and its map right."""
+        """Whether the long error is as good, and the map right."""
         return self.worst <= LONG_LIMIT and self.long_error <= max(FACTOR * other.long_error, other.long_error + SLACK)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """All that was tried on a log.
+    """The entries of a log.
 
     :ivar ours: the program as it is.
-    :ivar metric: one area for everything, with more and more particles.
+    :ivar metric: the program with a single area, with increasing numbers of particles.
     :ivar runs: {method: its run with the first seed}.
-    :ivar reference_name: what the errors are from.
+    :ivar reference_name: name of the reference of the errors.
     """
 
     ours: Entry
@@ -124,17 +123,17 @@ class Comparison:
 
     @property
     def memory_ratio(self) -> float:
-        """How many times as much memory the last metric filter takes."""
+        """Ratio of the memory of the last metric filter."""
         return self.metric[-1].peak / self.ours.peak
 
     @property
     def time_ratio(self) -> float:
-        """Likewise CPU time."""
+        """Ratio of the CPU time of the last metric filter."""
         return self.metric[-1].cpu / self.ours.cpu
 
 
 def measure_table(settings: Settings) -> Report:
-    """Map every log both ways."""
+    """Map every log with both programs."""
     names, seeds = settings.logs_or(COMPARED), settings.seeds_or(SEEDS)
     if strange := [name for name in names if name not in EXTENTS]:
         raise HmtSlamError(f"there is no {strange[0]!r} to compare on: choose from {', '.join(EXTENTS)}")
@@ -160,7 +159,7 @@ def measure_table(settings: Settings) -> Report:
 
 
 def _compile_kernels() -> None:
-    """One run that is not counted, for the kernels that are not in the cache."""
+    """Compile missing kernels in a run that does not count."""
     with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder, open_logs([BUNDLED]) as (log,):
         Runner(Path(folder), jobs=1).runs([ChartedCase(log, 0, variant=AREAS)])
 
@@ -198,7 +197,7 @@ def _compare_log(log: MeasuredLog, seeds: Sequence[int], changes: tuple[str, ...
 
 
 def requirements(campus: Comparison) -> list[Requirement]:
-    """What is asked for on the campus."""
+    """Requirements on the campus."""
     last = campus.metric[-1]
     accuracy = "as accurate" if campus.is_equal else "not as accurate"
     subject = f"metric RBPF of {last.particles} particles, {accuracy}, against HMT-SLAM on the campus"
@@ -210,7 +209,7 @@ def requirements(campus: Comparison) -> list[Requirement]:
 
 
 def comparison_table(found: dict[str, Comparison]) -> str:
-    """One line for every method on every log."""
+    """A table with a line for every method on every log."""
     head = ["log", "method", "particles", "areas", "loop closures", "CPU time [s]", "of it refinement"]
     head += ["peak memory [MB]", "of it before the first scan", "maps of the particles [MB]", "error [m]"]
     head += ["over 60 s [m]", "the largest [m]", "by", "as accurate"]
@@ -247,7 +246,7 @@ def _process_table(processes: dict[str, dict[str, float]]) -> str:
 
 @dataclass(frozen=True)
 class ChartedCase(Case):
-    """A run whose cost is told as it goes on.
+    """A run with the cost over time.
 
     :ivar variant: "areas" or "metric", see :mod:`benchmark.charted_run`.
     """
@@ -267,13 +266,13 @@ class ChartedCase(Case):
 
 
 def metric_case(log: MeasuredLog, seed: int, changes: tuple[str, ...], particles: int) -> ChartedCase:
-    """One area for everything, with so many particles."""
+    """The case with a single area, and a number of particles."""
     own = (f"local_map.extent={EXTENTS[log.name]:g}", f"filter.particles={particles}")
     return ChartedCase(log, seed, changes=(*changes, *own), variant=METRIC)
 
 
 class CachedRunner(Runner):
-    """Runs that stay in their folder, and are made anew only for another program or other parameters."""
+    """A runner that keeps runs in their folder, for the same program and parameters."""
 
     def _run(self, case: Case) -> Run:
         folder = self.folder.absolute() / case.name
@@ -291,15 +290,15 @@ class CachedRunner(Runner):
 
 
 def _fingerprint() -> str:
-    """What the runs of this code are known by."""
+    """A hash of the code, which identifies its runs."""
     return code_hash() + hashlib.sha256(Path(charted_run.__file__).read_bytes()).hexdigest()[:8]
 
 
 @contextmanager
 def open_compared_logs(names: Sequence[str]) -> Iterator[list[MeasuredLog]]:
-    """The logs of some names, the campus among them.
+    """The logs of some names, including the campus.
 
-    :raises HmtSlamError: for a name that is none, or a file that is not there.
+    :raises HmtSlamError: for an unknown name or a missing file.
     """
     with open_logs([name for name in names if name != CAMPUS]) as logs:
         by_name = {log.name: log for log in logs} | {CAMPUS: MeasuredLog(CAMPUS, Path(CAMPUS_WORLD))}
@@ -307,9 +306,9 @@ def open_compared_logs(names: Sequence[str]) -> Iterator[list[MeasuredLog]]:
 
 
 def choose_reference(log: MeasuredLog, run: Run) -> tuple[Relations, str]:
-    """Relations by which the trajectories of a log are judged, and where they are from.
+    """Relations for the trajectories of a log, and the name of their source.
 
-    :param run: of the program as it is, by which the others are judged where nothing else is known.
+    :param run: of the program as it is, which is the reference if there is no other.
     """
     if log.name == CAMPUS:
         return true_relations(read_true_poses(open_simulated(CAMPUS_WORLD))), "truth"
@@ -332,7 +331,7 @@ def score_run(run: Run, relations: Relations) -> RelationErrors:
 
 
 def plot_growth(path: Path, logs: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> None:
-    """Memory above that before the first scan, and time for a scan, over the log; as Fig. 9e of the paper.
+    """Draw memory above that before the first scan, and time of a scan, over the log, as Fig. 9e of the paper.
 
     :param logs: {log: {method: report of :mod:`benchmark.charted_run`}}.
     """
@@ -356,7 +355,7 @@ def plot_growth(path: Path, logs: Mapping[str, Mapping[str, Mapping[str, Any]]])
 
 
 def plot_processes(path: Path, logs: Mapping[str, Mapping[str, float]]) -> None:
-    """Mean time of every process for a scan; as Fig. 9c of the paper.
+    """Draw the mean time of every process for a scan, as Fig. 9c of the paper.
 
     :param logs: {log: {process: ms}}.
     """

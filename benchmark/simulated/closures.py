@@ -1,4 +1,4 @@
-"""Which loops the live hypotheses close, how right each of these closures is, and which are accepted."""
+"""Loop closures of the live hypotheses, their errors, and the accepted ones."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hmt_slam_ros.messages.map_changes import Arc
 from hmt_slam_ros.messages.messages import Hypotheses, Hypothesis
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 
-# Keyframes of the robot's area by which it is judged that this area joins another.
+# Newest keyframes of the robot's area that are compared with a known area.
 _RECENT = 5
 
 
@@ -35,11 +35,11 @@ class Closure:
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """What there is to say of a live hypothesis.
+    """The closures of a live hypothesis, compared with the truth.
 
-    :ivar wrong: whether it closed a loop that there is not, since the last time that a path was accepted.
-    :ivar missing: whether its last answer was new ground where there was a known place.
-    :ivar closures: those that are not accepted yet.
+    :ivar wrong: whether it closed a false loop since the last acceptance.
+    :ivar missing: whether its last answer was new ground instead of a known place.
+    :ivar closures: that are not accepted yet.
     """
 
     wrong: bool = False
@@ -53,17 +53,17 @@ class Path:
 
 
 class Paths:
-    """Follows the live hypotheses."""
+    """The paths of the live hypotheses."""
 
     def __init__(self, truth: Truth) -> None:
         self._truth = truth
         self.paths: Mapping[int, Path] = {FIRST_HYPOTHESIS: Path()}
 
     def follow(self, hypotheses: Hypotheses, replica: Replica, examinations: Mapping[int, Examination]) -> None:
-        """Learn of TSBI's answer.
+        """Update the paths by TSBI's answer.
 
-        :param replica: as it was before.
-        :param examinations: {parent: what it asked at this event}.
+        :param replica: before the answer.
+        :param examinations: {parent: its examination at this event}.
         """
         self.paths = {
             hypothesis.id: self._continue(
@@ -105,13 +105,13 @@ class Paths:
         return Closure(event, way, (other, known_area), assessment)
 
     def accepted(self, hypothesis: int, chosen: HybridMap) -> list[Closure]:
-        """The closures that become definite with a hypothesis, judged as they now are."""
+        """The closures that become definite with a hypothesis, with their current errors."""
         path = self.paths[hypothesis]
         self.paths = {hypothesis: replace(path, wrong=False, closures=())}
         return [self._reassess(closure, chosen) for closure in path.closures]
 
     def _reassess(self, closure: Closure, chosen: HybridMap) -> Closure:
-        """By the same keyframes; where one of them left the two areas, the verdict stands."""
+        """The closure with its current error by the same keyframes; unchanged if one of them left the two areas."""
         other, known_area = closure.areas
         known, examinations = closure.assessment.pair
         pose = chosen.arc(known_area, other)
@@ -124,12 +124,12 @@ class Paths:
 
 
 def closing_arcs(hypothesis: Hypothesis, before: HybridMap, examination: Examination | None) -> Iterator[Arc]:
-    """The arcs by which a leaf says where in a known area the robot is.
+    """The arcs of a hypothesis that place the robot in a known area.
 
     They close a loop that its parent had not closed, or are measured anew by keyframes that TSBI found in the area.
     """
     if hypothesis.removed_arcs:
-        return  # a question that TLCA opened again: nothing was observed
+        return  # a revision by TLCA, without an observation
     found = examination is not None and bool(hypothesis.moved_keyframes) and hypothesis.area in before.area_ids()
     for arc in hypothesis.arcs:
         value = before.arc_value(arc.source, arc.target)
@@ -138,7 +138,7 @@ def closing_arcs(hypothesis: Hypothesis, before: HybridMap, examination: Examina
 
 
 def known_end(hypothesis: Hypothesis, arc: Arc) -> int:
-    """The known one of the two areas of an arc: that which keyframes moved to, else that in which the robot is not."""
+    """The known area of an arc: the one that keyframes moved to, else the one without the robot."""
     if hypothesis.moved_keyframes:
         return hypothesis.area
     return arc.target if arc.source == hypothesis.area else arc.source
@@ -146,9 +146,9 @@ def known_end(hypothesis: Hypothesis, arc: Arc) -> int:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a forecast says of one answer to "in which known area are these keyframes?".
+    """The probability of one answer to the question in which known area keyframes lie.
 
-    :ivar area: the known area, -1 for none, -2 for what a hypothesis is that did not ask.
+    :ivar area: the known area, ``NEW`` for none, ``NOT_EXAMINED`` for a hypothesis without an examination.
     :ivar probability: of the forecast.
     :ivar right: whether the answer is true.
     """
@@ -164,7 +164,7 @@ NEW, NOT_EXAMINED = -1, -2
 def live_answers(
     hypotheses: Hypotheses, before: Replica, examinations: Mapping[int, Examination], paths: Mapping[int, Path]
 ) -> list[Answer]:
-    """The PMF over the live hypotheses after an event, by what each answered.
+    """The answers of the live hypotheses after an event, with the probability of each.
 
     :param paths: after the event.
     """
@@ -183,7 +183,7 @@ def answers_by_arcs(
     paths: Mapping[int, Path],
     truth: Truth,
 ) -> list[tuple[Answer, int]]:
-    """The forecast of one who knows the arcs but looks at no scan, with the number of its known areas.
+    """The answers by the arcs alone, without scans, each with the number of known areas.
 
     :param hypotheses: (id, probability) before the event.
     :param paths: before the event.

@@ -1,4 +1,4 @@
-"""Comparisons of keyframes with known areas, as TSBI makes them, and the truth of each: data to fit the model on."""
+"""TSBI's comparisons of keyframes with known areas, with the truth of each: data to fit the model."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ _NO_MATCH = (0, _NAN, 0, 0)
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """One hypothesis's keyframes, compared with its known areas.
+    """The comparison of a hypothesis's keyframes with its known areas.
 
     :ivar kind: "cut" or "recheck".
     :ivar parent: the hypothesis before the event.
     :ivar query: its keyframes in question.
-    :ivar compared: {known area: keyframes that had been compared with it before}.
-    :ivar excluded: areas that were neither candidates nor part of a candidate's map.
-    :ivar found: what came of it.
-    :ivar views: grids of keyframes and areas, as the search builds them.
+    :ivar compared: {known area: keyframes that were compared with it before}.
+    :ivar excluded: areas that are neither candidates nor part of a candidate's map.
+    :ivar found: result of the comparison.
+    :ivar views: grids of keyframes and areas of the search.
     :ivar descriptors: of keyframes.
     """
 
@@ -85,7 +85,7 @@ ExaminationListener = Callable[[Examination], None]
 
 
 class ObservedBranching(Branching):
-    """Makes the children of hypotheses, as always, and tells what they were made from."""
+    """A branching that passes its examinations to a listener."""
 
     def __init__(self, configuration: Configuration, replica: Replica, listener: ExaminationListener) -> None:
         super().__init__(configuration, replica, composition.landmark_evidence)
@@ -94,11 +94,11 @@ class ObservedBranching(Branching):
         self._listener = listener
 
     def cut(self, parent: Parent, keyframes: Sequence[int]) -> Branches:
-        """As always."""
+        """As of the base class, with the listener."""
         return self._report("cut", parent, super().cut(parent, keyframes))
 
     def recheck(self, parent: Parent, only: Collection[int] = ()) -> Branches:
-        """As always."""
+        """As of the base class, with the listener."""
         return self._report("recheck", parent, super().recheck(parent, only))
 
     def _report(self, kind: str, parent: Parent, branches: Branches) -> Branches:
@@ -110,7 +110,7 @@ class ObservedBranching(Branching):
 
 
 class _ObservedSearch(ClosureSearch):
-    """Remembers its last comparison."""
+    """A closure search that keeps its last comparison."""
 
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
         super().__init__(configuration, scans)
@@ -118,7 +118,7 @@ class _ObservedSearch(ClosureSearch):
 
     @property
     def views(self) -> GridCache:
-        """Grids that were built and are kept."""
+        """Cached grids."""
         return self._grid_cache
 
     def compare(
@@ -131,21 +131,21 @@ class _ObservedSearch(ClosureSearch):
         most: int,
         only: Collection[int] = (),
     ) -> AreaComparison:
-        """As always."""
+        """As of the base class, with the listener."""
         found = super().compare(hybrid_map, area, query, compared, excluded, most, only)
         self._last = query, compared, frozenset(excluded), found
         return found
 
     def take(self) -> _Comparison | None:
-        """The last comparison since it was taken."""
+        """Return and forget the last comparison."""
         last, self._last = self._last, None
         return last
 
 
 class Match(NamedTuple):
-    """How surface samples lie in a map.
+    """The match of surface samples with a map.
 
-    :ivar samples: how many there are.
+    :ivar samples: number of samples.
     :ivar score: sum of their log-ratios, not tempered, nats.
     :ivar on: samples on known surfaces.
     :ivar free: samples in space that is known to be free.
@@ -158,20 +158,20 @@ class Match(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One mode in one known area, or that there is none (``mode`` -1).
+    """A mode in a known area; ``mode`` is -1 if there is none.
 
     :ivar event: the keyframe event.
     :ivar kind: 0 for a cut, 1 for a re-check.
-    :ivar hypothesis: that asks; ``log_probability``, its own, the newest scan counted.
-    :ivar area: that the keyframes are in.
-    :ivar known: the area that they are compared with.
+    :ivar hypothesis: parent; ``log_probability``, its own, including the newest scan.
+    :ivar area: of the keyframes.
+    :ivar known: area that they are compared with.
     :ivar mode: number of the mode, the heaviest first.
     :ivar traveled: path length since the start, m.
     :ivar loop: path driven since the known area's newest keyframe, m.
-    :ivar query_size: number of the keyframes in question, those not compared with the area before.
+    :ivar query_size: number of keyframes that were not compared with the area before.
     :ivar keyframes: number of the known area's own.
     :ivar share: pi of the area by itself; ``pi``, in the transition model; ``new``, of new ground there.
-    :ivar descriptor: log p(phi), nats, which is no part of the weight.
+    :ivar descriptor: log p(phi), nats, which is not part of the weight.
     :ivar log_mass: log of the mode's part of the evidence integral, nats.
     :ivar log_weight: of the fit, relative to new ground.
     :ivar prior_x: deviation of the prior by the arcs along its axes, widened; likewise ``prior_y`` (m), ``prior_turn``
@@ -183,11 +183,11 @@ class Row(NamedTuple):
     :ivar samples: to ``free``: the keyframes' samples in the area's map at the mode, as :class:`Match`.
     :ivar reverse_samples: to ``back_free``: the area's samples in the keyframes' map there.
     :ivar true_score: to ``true_free``: as ``score``, at the true pose; NaN where the places are not the same.
-    :ivar right: 1 where the claim is true, 0 where it is false.
-    :ivar apart: to ``error_turn``: of the claim, m, m, degrees.
+    :ivar right: 1 for a true mode, 0 for a false one.
+    :ivar apart: to ``error_turn``: of its error, m, m, degrees.
     :ivar in_place: share of the keyframes that truly are in the area's place.
-    :ivar known_right: whether it is right to say that they are; ``new_right``, that they are in no known place.
-    :ivar view: share of what the middle keyframe saw that the area's nearest ones saw too.
+    :ivar known_right: whether "in the area" is a right answer; ``new_right``, whether "new ground" is.
+    :ivar view: share of the middle keyframe's view that the nearest ones of the area have too.
     """
 
     event: int
@@ -240,7 +240,7 @@ class Row(NamedTuple):
 def examination_rows(
     examination: Examination, truth: Truth, configuration: Configuration, event: int, traveled: dict[int, float]
 ) -> Iterator[Row]:
-    """The rows of one examination.
+    """The rows of an examination.
 
     :param traveled: {keyframe: path length since the start, m}.
     """
@@ -265,19 +265,19 @@ def examination_rows(
 
 
 def new_is_right(examination: Examination, truth: Truth) -> bool:
-    """Whether it is right to say that the keyframes lie in no known place: most of them do not."""
+    """Whether new ground is a right answer, because most of the keyframes lie in no known place."""
     known = [k for area in examination.known_areas for k in examination.hybrid_map.keyframes(area)]
     return 2.0 * truth.share_in(examination.keyframes, known, (1.0 - TOLERANCE) * RADIUS) < 1.0
 
 
 def known_is_right(examination: Examination, truth: Truth, area: int) -> bool:
-    """Whether it is right to say that the keyframes lie in a known area's place."""
+    """Whether a known area is a right answer, because most of the keyframes lie in its place."""
     known = list(examination.hybrid_map.keyframes(area))
     return 2.0 * truth.share_in(examination.keyframes, known, (1.0 + TOLERANCE) * RADIUS) >= 1.0
 
 
 class _Candidate:
-    """A known area that the keyframes were compared with."""
+    """A known area that the keyframes were compared with, and its columns."""
 
     def __init__(self, examination: Examination, truth: Truth, configuration: Configuration, area: int) -> None:
         self._examination, self._truth, self._options, self._area = examination, truth, configuration.tsbi, area
@@ -297,7 +297,7 @@ class _Candidate:
         return share, model.known[self._area], model.new
 
     def mode_values(self, fit: Fit | None) -> tuple[float, ...]:
-        """All that there is to say of a mode."""
+        """The columns of a mode."""
         deviations = np.sqrt(np.diag(self._prior.covariance))
         descriptor = self._descriptor_log_ratio()
         if fit is None:
@@ -349,18 +349,18 @@ class _Candidate:
         return _match(self._grid.points, pose, self._place.grid)[1:]
 
     def _nearest(self) -> tuple[int, Pose]:
-        """The area's keyframe nearest to the reference, and ``area_T_reference`` as it follows from there."""
+        """The area's keyframe nearest to the reference, and ``area_T_reference`` by that keyframe."""
         reference = self._truth.poses[self._examination.keyframes[0]]
         nearest = min(self.known, key=lambda k: float(np.hypot(*(self._truth.poses[k] - reference)[:2])))
         return nearest, se2.compose(self.known[nearest], se2.between(self._truth.poses[nearest], reference))
 
     def place_truth(self) -> tuple[float, int]:
-        """Share of the keyframes in the area's place, and whether it is right to say that they are."""
+        """Share of the keyframes in the area's place, and whether the area is a right answer."""
         share = self._truth.share_in(self._examination.keyframes, list(self.known), RADIUS)
         return share, int(known_is_right(self._examination, self._truth, self._area))
 
     def view(self) -> float:
-        """Of what the middle keyframe saw, the largest share that one of the area's nearest saw too."""
+        """Largest share of the middle keyframe's view that one of the area's nearest keyframes has too."""
         keyframes = list(self.unmatched)
         middle = keyframes[len(keyframes) // 2]
         here = self._truth.poses[middle]
@@ -375,7 +375,7 @@ class _Candidate:
 
 
 def _match(points: NDArray[np.float64], pose: Pose, grid: AreaGrid) -> Match:
-    """How samples that stand at ``grid_T_points`` lie in a grid."""
+    """The match of samples at ``grid_T_points`` with a grid."""
     found = grid.compare(points, pose)
     score = log_ratio_at(LogRatioGrid(grid.fine_log_ratio, grid.origin, 0.5 * grid.cell), points, pose)
     return Match(found.samples, score, found.on_surface, found.in_free_space)

@@ -1,8 +1,7 @@
-"""Watched runs of simulated worlds, each in a process of its own, kept in a folder and made once.
+"""Records of runs of simulated worlds, each in its own process, kept in a folder.
 
 ``python -m benchmark.simulated.records FOLDER FILE.csv`` writes all comparisons of a folder as one table. The columns
-are those of ``benchmark.simulated.examinations.Row`` behind ``family`` and ``seed``; what could not be computed is
-empty.
+are those of ``benchmark.simulated.examinations.Row`` after ``family`` and ``seed``; missing values are empty.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ _TAIL = 3  # lines of a failed run that go into a message
 
 @cache
 def code_hash() -> str:
-    """What the records of this code are known by: a hash of the program and its parameters."""
+    """A hash of the program and its parameters, which identifies its records."""
     digest = hashlib.sha256(PARAMETERS.read_bytes())
     for folder in ("hmt_slam_ros", "benchmark/simulated"):
         for file in sorted((ROOT / folder).rglob("*.py")):
@@ -41,7 +40,7 @@ def code_hash() -> str:
 
 
 def read_record(path: Path) -> Record:
-    """A record as it was written."""
+    """Read a record."""
     with gzip.open(path, "rt", encoding="utf-8") as source:
         record: Record = json.load(source)
     return record
@@ -59,9 +58,9 @@ def read_records(folder: Path) -> Iterator[Record]:
 
 
 class Records:
-    """Makes records, each once.
+    """Makes records, each at most once.
 
-    :ivar folder: where they are kept; those in it that another program or other parameters made are made anew.
+    :ivar folder: of the records; those of another program or other parameters are replaced.
     :ivar jobs: runs at the same time.
     """
 
@@ -91,7 +90,7 @@ class Records:
         )
         if result.returncode:
             last_lines = " | ".join(result.stderr.strip().splitlines()[-_TAIL:]) or "nothing"
-            raise HmtSlamError(f"the run {world.name} failed, it said: {last_lines}")
+            raise HmtSlamError(f"the run {world.name} failed: {last_lines}")
         record = read_record(path)
         print(f"{world.name}: {record['cpu_s']:.1f} CPU s", file=sys.stderr, flush=True)
         return record

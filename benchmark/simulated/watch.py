@@ -1,4 +1,4 @@
-"""Watches the five processes on a simulated log: what they say, and what is true of it.
+"""Runs the five processes on a simulated log, and compares their messages with the truth.
 
 ``python -m benchmark.simulated.watch FAMILY SEED FILE [NAME=VALUE ...]`` maps a simulated log. FILE becomes a JSON
 document, gzipped.
@@ -42,18 +42,18 @@ from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 Entry = dict[str, Any]
 
-_POSE_PERIOD = 2_000_000_000  # ns between two poses of RTL that are judged
+_POSE_PERIOD = 2_000_000_000  # ns between two poses of RTL that are scored
 
 
 @dataclass(frozen=True)
 class _ObservedProcess:
-    """A process of which somebody hears all that it says."""
+    """A process whose messages are passed to a listener."""
 
     process: Process
     listener: Callable[[Message], None]
 
     def handle(self, message: Message) -> list[Message]:
-        """As the process does."""
+        """Handle a message as the process."""
         messages = self.process.handle(message)
         for answer in messages:
             self.listener(answer)
@@ -62,16 +62,16 @@ class _ObservedProcess:
 
 @dataclass
 class Watch:
-    """Judges a run while it goes on.
+    """Scores a run while it is made.
 
     :ivar truth: about the keyframes.
     :ivar traveled: {keyframe event: path length since the start, m}.
     :ivar rows: of all comparisons with known areas.
-    :ivar events: keyframe events at which there was a known area that the keyframes fit into.
+    :ivar events: keyframe events with a fit in a known area.
     :ivar accepted: the closures that became definite.
     :ivar poses: of RTL.
     :ivar pmf: the live hypotheses after every keyframe event.
-    :ivar loops: that there are to close.
+    :ivar loops: of the drive.
     """
 
     log: SimulatedLog
@@ -105,7 +105,7 @@ class Watch:
         self.loops.finish()
 
     def branching(self, configuration: Configuration, replica: Replica) -> Branching:
-        """What makes the children of hypotheses, watched."""
+        """The branching of TSBI, with a listener."""
         return ObservedBranching(configuration, replica, self._add_examination)
 
     def _on_message(self, message: Message) -> None:
@@ -155,7 +155,7 @@ class Watch:
         self._replica.apply_hypotheses(hypotheses)
 
     def _record_pmf(self, hypotheses: Hypotheses) -> None:
-        """Keep the PMF, and the loops that every hypothesis closes now: those that there are, and those that not."""
+        """Add the PMF, with the numbers of true and false loops that every hypothesis closes now."""
         entries = []
         for hypothesis in hypotheses.hypotheses:
             closures = self._paths.paths[hypothesis.id].closures
@@ -204,7 +204,7 @@ class Watch:
         }
 
     def _score_pose(self, pose: RealTimePose) -> None:
-        """Errors of the pose in the map and of that in the robot's area."""
+        """Add the errors of the pose in the map and in the robot's area."""
         best = self._replica.maps[self._replica.best_hypothesis]
         if pose.area not in best.area_ids():
             return
@@ -221,7 +221,7 @@ class Watch:
         )
 
     def arc_errors(self) -> list[Entry]:
-        """Errors of the arcs of the most probable map as it is now."""
+        """Errors of the arcs of the current most probable map."""
         best = self._replica.maps[self._replica.best_hypothesis]
         frames = {area: self.truth.frame(best, area) for area in best.area_ids()}
         return [
@@ -230,7 +230,7 @@ class Watch:
         ]
 
     def area_pose_errors(self) -> list[Entry]:
-        """Errors of the areas' poses in the map as TLCA last gave them."""
+        """Errors of the areas' poses of the last closure decision."""
         best = self._replica.maps[self._replica.best_hypothesis]
         origin = self.truth.frame(best, FIRST_AREA)
         return [
@@ -241,7 +241,7 @@ class Watch:
 
 
 def _pose_error(belief: PoseGaussian, truth: Pose) -> Entry:
-    """Translation (m) and rotation (degrees) of an error, its NEES and the deviation that is stated (m)."""
+    """Translation (m) and rotation (degrees) of an error, its NEES and the stated deviation (m)."""
     error = se2.between(belief.mean, truth)
     return {
         "translation": float(np.hypot(error[0], error[1])),
@@ -252,7 +252,7 @@ def _pose_error(belief: PoseGaussian, truth: Pose) -> Entry:
 
 
 def observe_world(world: World, changes: Sequence[str] = ()) -> dict[str, Any]:
-    """All that is kept of a run."""
+    """Run a world; return its record."""
     begin = time.process_time()
     watch = Watch(open_simulated(world.log), load_configuration(PARAMETERS, list(changes), world.seed))
     watch.run()
@@ -289,8 +289,8 @@ def _loop_entry(loop: Loop) -> dict[str, Any]:
     }
 
 
-def _make_json_safe(value: Any) -> Any:  # noqa: ANN401  whatever is in a record
-    """The same in what JSON knows, figures to seven digits."""
+def _make_json_safe(value: Any) -> Any:  # noqa: ANN401  any content of a record
+    """The same value for JSON, with seven digits."""
     if isinstance(value, dict):
         return {name: _make_json_safe(entry) for name, entry in value.items()}
     if isinstance(value, (list, tuple)):
@@ -308,7 +308,7 @@ def main(arguments: Sequence[str]) -> int:
     except HmtSlamError as fault:
         print(f"watch: {fault}", file=sys.stderr)
         return 2
-    # Under another name first, so that an interrupted run leaves nothing that looks like a record.
+    # The file is renamed when it is complete, so that an interrupted run leaves no record.
     part = Path(f"{file}.part")
     with gzip.open(part, "wt", encoding="utf-8") as target:
         json.dump(_make_json_safe(record), target, allow_nan=False)
