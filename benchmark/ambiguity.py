@@ -279,7 +279,7 @@ def trace_hypotheses(pmf: Sequence[Mapping[str, Any]], begin: int) -> list[Momen
     for entry in pmf:
         if entry["event"] < begin:
             continue
-        hypotheses = entry["leaves"]
+        hypotheses = entry["hypotheses"]
         kinds = {
             hypothesis["hypothesis"]: _classify(kinds.get(hypothesis["parent"], NEW), hypothesis)
             for hypothesis in hypotheses
@@ -376,7 +376,7 @@ def trace_of_recorder(recorder: Recorder) -> list[dict[str, Any]]:
             for hypothesis in message.hypotheses
         ]
         position = {"event": event, "stamp": keyframe.scan.stamp, "traveled": keyframe.path_length}
-        entries.append(position | {"unexamined": message.unexamined, "leaves": entries_of_event})
+        entries.append(position | {"unexamined": message.unexamined, "hypotheses": entries_of_event})
     return entries
 
 

@@ -195,8 +195,8 @@ def visit_twice(world: str, seed: int, size: float = SIZE, rate: float = RATE) -
         scores.new,
         scores.gone,
         scores.kept,
-        unexplainedmean(images[0], frames[0], surfaces[0].walls),
-        unexplainedmean(images[1], frames[1], np.concatenate((surfaces[1].walls, scores.hidden))),
+        unexplained_share(images[0], frames[0], surfaces[0].walls),
+        unexplained_share(images[1], frames[1], np.concatenate((surfaces[1].walls, scores.hidden))),
         *_errors(second.recording, logs),
         (first.keyframes, second.keyframes),
         scores.lengths,
@@ -400,7 +400,7 @@ def score_changes(
     return ChangeScores(mean(found), mean(ghosts), mean(kept), lengths, hidden)
 
 
-def unexplainedmean(image: OccupancyImage, frame: Points, walls: NDArray[np.float64]) -> float:
+def unexplained_share(image: OccupancyImage, frame: Points, walls: NDArray[np.float64]) -> float:
     """Share of the occupied cells that are far from all surfaces.
 
     :param frame: ``world_T_map``, shape (3,).

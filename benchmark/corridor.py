@@ -187,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help="seeds 0 to N-1")
     seeds = parser.parse_args(arguments).seeds
     if seeds < 1:
-        parser.error(f"--seeds {seeds} leaves nothing to measure: give 1 or more")
+        parser.error(f"--seeds {seeds} is too small: give 1 or more")
     print(report([drive(seed) for seed in range(seeds)]))
     return 0
 

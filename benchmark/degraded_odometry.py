@@ -13,7 +13,7 @@ missing     5 % of the readings, drawn at random, are missing
 none        all readings are missing
 ==========  ==========================================================================================================
 
-The noise is a random walk: its variance grows with the distance and the angle traveled, whatever the rate of the
+The noise is a random walk: its variance grows with the distance and the angle traveled, for any rate of the
 readings, and over one meter or one radian the deviation is the motion model's. The same log, kind and seed give the
 same readings, bit for bit.
 """

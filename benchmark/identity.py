@@ -241,7 +241,7 @@ def read_expected(path: Path) -> tuple[dict[str, Digests], str]:
 def write_expected(path: Path, found: Mapping[str, Digests], machine: str) -> None:
     """Record digests."""
     lines = [
-        "# Digests of a fixed set of runs; benchmark/identity.py says of what.",
+        "# Digests of the set of runs in benchmark/identity.py.",
         "# Written by `python -m benchmark identity --write-expected`; do not edit.",
         f'commit = "{describe_circumstances((0,), 1, ())["commit"]}"',
         f'machine = "{machine}"',

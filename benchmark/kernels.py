@@ -216,11 +216,11 @@ def _measure_simulation(timer: Timer) -> None:
     scenario = open_simulated("sim:busy").scenario
     numbers = range(0, scenario.scan_stamps.size, 10)
     poses = scenario.true_poses(scenario.scan_stamps)
-    nobody = np.empty((0, 3))
+    no_people = np.empty((0, 3))
 
     def cast_all() -> None:
         for number in numbers:
-            scenario.laser.distances(poses[number : number + 1], scenario.walls, nobody)
+            scenario.laser.distances(poses[number : number + 1], scenario.walls, no_people)
 
     timer.add("ray casting, a scan of 361 beams", len(numbers), cast_all)
     timer.add("simulation, a scan of 361 beams", len(numbers), lambda: [scenario.scan(k) for k in numbers])

@@ -67,7 +67,7 @@ def dataset_folder() -> Path:
 
 
 def reason_missing(name: str) -> str:
-    """The sentence that says why a log is missing; empty for one that is there.
+    """The reason for which a log is missing, as a sentence; empty for one that is there.
 
     :param name: one of ``LOGS``.
     """

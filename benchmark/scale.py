@@ -319,7 +319,7 @@ def _fill_replica(replica: Replica, lattice: Lattice) -> Replica:
 
 
 def _loop_poses() -> Float64:
-    """Poses around the loop, turning on the spot at its corners, shape (n, 3)."""
+    """Poses around the loop, turning in place at its corners, shape (n, 3)."""
     poses: list[Float64] = []
     for side, (start, end) in enumerate(pairwise(SPACING * np.array(_LOOP, dtype=np.float64))):
         heading = 0.5 * math.pi * side

@@ -178,7 +178,7 @@ def read_expected(path: Path) -> dict[str, dict[str, Expected]]:
 def write_expected(path: Path, figures: Mapping[str, Figures]) -> None:
     """Write means and deviations over the seeds, of which every figure has as many."""
     lines = [
-        "# Means and sample deviations over some seeds; benchmark/short.py says how they become bounds.",
+        "# Means and sample deviations over some seeds, from which benchmark/short.py computes bounds.",
         "# Written by `python -m benchmark short --write-expected`; do not edit.",
         f'commit = "{describe_commit()}"',
         f"seeds = {len(next(iter(next(iter(figures.values())).values())))}",

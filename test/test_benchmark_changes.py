@@ -40,29 +40,29 @@ def visits(lasers=LASERS):
 def test_a_map_is_judged_by_what_is_new_and_what_is_gone(after, new, gone):
     found = score_changes([image_of(*BEFORE), image_of(*after)], [FRAME, FRAME], visits())
     assert (found.new, found.gone, found.kept) == (new, gone, 1.0)
-    assert found.metres == pytest.approx((1.05, 1.05), abs=0.11)
+    assert found.lengths == pytest.approx((1.05, 1.05), abs=0.11)
 
 
 def test_what_could_not_be_seen_is_not_asked_for():
-    away = LASERS + np.array([0.0, 0.0, np.pi])
-    found = score_changes([image_of(*BEFORE), image_of(*BEFORE)], [FRAME, FRAME], visits(away))
+    lasers_turned = LASERS + np.array([0.0, 0.0, np.pi])
+    found = score_changes([image_of(*BEFORE), image_of(*BEFORE)], [FRAME, FRAME], visits(lasers_turned))
     assert np.isnan(found.gone)
     assert unexplained_share(image_of(*BEFORE), FRAME, np.concatenate((AFTER, found.hidden))) == 0.0
 
 
 def test_cells_far_from_all_walls_are_unexplained():
-    somebody = [2.0, 1.0, 2.5, 1.0]
-    assert unexplained_share(image_of(*BEFORE, somebody), FRAME, BEFORE) == pytest.approx(5 / 55)
+    person = [2.0, 1.0, 2.5, 1.0]
+    assert unexplained_share(image_of(*BEFORE, person), FRAME, BEFORE) == pytest.approx(5 / 55)
 
 
 def test_what_falls_short_is_told():
     good = Visit(0.9, 0.05, 0.99, 0.0, 0.001, 0.02, 0.08, (100, 120), (5.0, 5.0))
     assert all(
-        asked.met for asked in requirements("quiet", [good], [100, 110, 112], [LocalizationVisit(True, 0.03, 0.09)])
+        requirement.met for requirement in requirements("quiet", [good], [100, 110, 112], [LocalizationVisit(True, 0.03, 0.09)])
     )
     bad = Visit(0.7, 0.2, 0.9, 0.003, 0.01, 0.05, 0.2, (100, 120), (5.0, 5.0))
     assert not any(
-        asked.met for asked in requirements("quiet", [bad], [100, 110, 120], [LocalizationVisit(False, 0.2, 0.3)])
+        requirement.met for requirement in requirements("quiet", [bad], [100, 110, 120], [LocalizationVisit(False, 0.2, 0.3)])
     )
 
 

@@ -34,9 +34,9 @@ class ListedLog:
             yield LogRecord(stamp, Scan(stamp, np.ones(3, dtype=np.float32), 0.0, 0.1, 0.0, 10.0))
 
 
-def straight(metres, readings):
+def straight(distance, readings):
     poses = np.zeros((readings + 1, 3))
-    poses[:, 0] = np.linspace(0.0, metres, readings + 1)
+    poses[:, 0] = np.linspace(0.0, distance, readings + 1)
     return ListedLog(poses)
 
 
@@ -66,19 +66,19 @@ def test_scans_and_stamps_stay_and_one_seed_gives_one_log(kind):
     stamps = [reading.stamp for reading in readings(worse)]
     assert set(stamps) <= {reading.stamp for reading in readings(log)}
     assert stamps == [reading.stamp for reading in readings(again)]
-    for one, two in zip(readings(worse), readings(again), strict=True):
-        np.testing.assert_array_equal(one.pose, two.pose)
+    for reading, other_reading in zip(readings(worse), readings(again), strict=True):
+        np.testing.assert_array_equal(reading.pose, other_reading.pose)
     if kind not in {"none", "missing"}:
-        assert any((one.pose != two.pose).any() for one, two in zip(readings(worse), readings(other), strict=True))
+        assert any((reading.pose != other_reading.pose).any() for reading, other_reading in zip(readings(worse), readings(other), strict=True))
 
 
 @pytest.mark.parametrize(("kind", "factor"), [("noise-2x", np.sqrt(3.0)), ("noise-4x", np.sqrt(15.0))])
-@pytest.mark.parametrize("per_metre", [4, 40])
-def test_the_noise_over_a_metre_is_the_models_whatever_the_rate_of_the_readings(kind, factor, per_metre):
-    metres = 2000
-    errors = increments(degrade_log(straight(metres, metres * per_metre), kind, 0)) - [1.0 / per_metre, 0.0, 0.0]
+@pytest.mark.parametrize("per_meter", [4, 40])
+def test_the_noise_over_a_metre_is_the_models_whatever_the_rate_of_the_readings(kind, factor, per_meter):
+    distance = 2000
+    errors = increments(degrade_log(straight(distance, distance * per_meter), kind, 0)) - [1.0 / per_meter, 0.0, 0.0]
     # The lateral errors of the readings within one metre are of the frame of each, not turned by those before.
-    deviations = errors.reshape(metres, per_metre, 3).sum(axis=1).std(axis=0)
+    deviations = errors.reshape(distance, per_meter, 3).sum(axis=1).std(axis=0)
     np.testing.assert_allclose(deviations, factor * np.array([0.1, 0.1, np.radians(2.0)]), rtol=0.05)
 
 

@@ -46,20 +46,20 @@ def institute():
     states = scenario.building.states
     kinds = [CROSSING if crossing else DOOR for crossing in states.crossings]
     nodes = tuple(ChartNode(0, pose, kind, 1.0, ()) for pose, kind in zip(states.poses, kinds, strict=True))
-    ways = [Edge(k, d, k + 1, d, (5.0, 0.01), (0.0, 0.01), EMPTY) for k, d in enumerate((NORTH, NORTH, EAST))]
-    edges = tuple(edge for way in ways for edge in (way, way.reverse))
+    edges_one_way = [Edge(k, d, k + 1, d, (5.0, 0.01), (0.0, 0.01), EMPTY) for k, d in enumerate((NORTH, NORTH, EAST))]
+    edges = tuple(edge for edge in edges_one_way for edge in (edge, edge.reverse))
     return InstituteMap(scenario, None, {}, {}, Chart(nodes, (), edges), {0: np.zeros(3)})
 
 
 def test_missions_are_from_open_door_to_open_door():
-    charted = institute()
-    doors = [k for k, node in enumerate(charted.chart.nodes) if node.kind == DOOR]
-    places = {k: behind_door(k, charted.nodes[k]) for k in doors}
-    assert open_doors(charted, charted.scenario, places) == doors
+    chart_map = institute()
+    doors = [k for k, node in enumerate(chart_map.chart.nodes) if node.kind == DOOR]
+    places = {k: behind_door(k, chart_map.nodes[k]) for k in doors}
+    assert open_doors(chart_map, chart_map.scenario, places) == doors
     changed = scenario_of(0, visit=1, changed=0.5)
-    assert set(open_doors(charted, changed, places)) < set(doors)
-    opposite = {k: behind_door(k, charted.nodes[k] + (0.0, 0.0, np.pi)) for k in doors}
-    assert open_doors(charted, charted.scenario, opposite) == []
+    assert set(open_doors(chart_map, changed, places)) < set(doors)
+    opposite = {k: behind_door(k, chart_map.nodes[k] + (0.0, 0.0, np.pi)) for k in doors}
+    assert open_doors(chart_map, chart_map.scenario, opposite) == []
 
 
 def behind_door(node, pose):
@@ -70,10 +70,10 @@ def behind_door(node, pose):
 
 
 def test_the_shortest_way_between_two_nodes():
-    charted = institute()
-    assert path_length(charted, 0, 2) == pytest.approx(10.0)
-    assert path_length(charted, 3, 0) == pytest.approx(15.0)
-    assert float(se2.wrap(charted.nodes[0, 2] - charted.scenario.building.states.poses[0, 2])) == 0.0
+    chart_map = institute()
+    assert path_length(chart_map, 0, 2) == pytest.approx(10.0)
+    assert path_length(chart_map, 3, 0) == pytest.approx(15.0)
+    assert float(se2.wrap(chart_map.nodes[0, 2] - chart_map.scenario.building.states.poses[0, 2])) == 0.0
 
 
 def estimate(arrivals, right=True, confident=True):
@@ -104,7 +104,7 @@ def chart_of_states(changed=()):
 def test_a_chart_of_the_states_has_all_and_confuses_none():
     found = score_chart(chart_of_states())
     assert (found.states, found.detected, found.confused) == (13, 13, 0)
-    np.testing.assert_allclose(found.off, 0.1)
+    np.testing.assert_allclose(found.offsets, 0.1)
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def test_a_chart_of_the_states_has_all_and_confuses_none():
 def test_what_is_missing_and_what_is_confused(change, detected, confused):
     found = score_chart(chart_of_states({0: change}.items()))
     assert (found.detected, found.confused) == (detected, confused)
-    assert math.isclose(max(found.off), 0.1)
+    assert math.isclose(max(found.offsets), 0.1)
 
 
 def test_the_document_has_a_place_for_it():

@@ -18,14 +18,14 @@ from hmt_slam_ros.open_log import open_log
 LOST, RIGHT, WRONG = (False, False, False), (True, True, True), (True, True, False)
 
 
-def told(*said):
+def summarize(*states):
     return summarize_drive(
-        [LocalizationReport(float(k), *one) for k, one in enumerate(said)], (0.02, 0.03), float(len(said))
+        [LocalizationReport(float(k), *one) for k, one in enumerate(states)], (0.02, 0.03), float(len(states))
     )
 
 
 @pytest.mark.parametrize(
-    ("said", "noticed", "again", "confident", "wrong"),
+    ("states", "noticed", "again", "confident", "wrong"),
     [
         ((WRONG, WRONG, LOST, LOST, RIGHT, RIGHT), 2.0, 4.0, 0.0, False),
         ((WRONG, LOST, WRONG, WRONG, RIGHT), 1.0, 4.0, 2.0, False),
@@ -34,15 +34,15 @@ def told(*said):
     ],
     ids=["noticed and found", "found in a wrong place first", "never noticed", "lost again"],
 )
-def test_a_drive_is_judged_by_what_the_robot_says(said, noticed, again, confident, wrong):
-    found = told(*said)
+def test_a_drive_is_judged_by_what_the_robot_says(states, noticed, again, confident, wrong):
+    found = summarize(*states)
     assert (found.noticed, found.again, found.confident, found.wrong) == (noticed, again, confident, wrong)
 
 
 def test_a_confident_wrong_answer_and_one_that_comes_late_are_faults():
-    met = [one.met for one in requirements("office, known", [told(LOST, RIGHT), told(LOST, WRONG, WRONG, RIGHT)])]
+    met = [one.met for one in requirements("office, known", [summarize(LOST, RIGHT), summarize(LOST, WRONG, WRONG, RIGHT)])]
     assert met == [True, False]
-    assert not requirements("office, known", [told(*[WRONG] * 7, LOST)])[0].met
+    assert not requirements("office, known", [summarize(*[WRONG] * 7, LOST)])[0].met
 
 
 @pytest.mark.parametrize("kind", KINDS)

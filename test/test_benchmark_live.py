@@ -9,8 +9,8 @@ from benchmark.live import FAST, MessageTimes, count_unanswered, measure_fast
 
 
 def test_a_delay_is_that_from_a_message_to_its_answer():
-    passed = MessageTimes({1: 10.0, 2: 11.0, 3: 12.0}, {2: 11.5, 3: 12.25, 9: 13.0})
-    np.testing.assert_allclose(passed.delays, [0.5, 0.25])
+    times = MessageTimes({1: 10.0, 2: 11.0, 3: 12.0}, {2: 11.5, 3: 12.25, 9: 13.0})
+    np.testing.assert_allclose(times.delays, [0.5, 0.25])
 
 
 def test_messages_before_the_first_answer_are_not_missing():
@@ -18,6 +18,6 @@ def test_messages_before_the_first_answer_are_not_missing():
 
 
 def test_a_laser_with_forty_scans_a_second_is_kept_up_with():
-    passed = measure_fast(FAST, seconds=4.0)
-    assert len(passed.asked) == len(passed.delays) == 161
-    assert np.median(passed.delays[-20:]) < 1.0
+    times = measure_fast(FAST, seconds=4.0)
+    assert len(times.sent) == len(times.delays) == 161
+    assert np.median(times.delays[-20:]) < 1.0

@@ -23,7 +23,7 @@ from benchmark.calibration import (
 )
 from benchmark.loops import closing_distances, find_faults, missed_share
 from benchmark.report import VALIDATION, Requirement, document_marks
-from benchmark.simulated.closures import NEW, NOT_ASKED
+from benchmark.simulated.closures import NEW, NOT_EXAMINED
 
 
 def answer(area, probability, right):
@@ -54,7 +54,7 @@ EVENT = {
         answer(2, 0.3, True),
         answer(3, 0.1, False),
         answer(NEW, 0.15, False),
-        answer(NOT_ASKED, 0.05, True),
+        answer(NOT_EXAMINED, 0.05, True),
     ],
 }
 

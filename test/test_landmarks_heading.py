@@ -91,7 +91,7 @@ def test_where_nothing_is_seen_the_variance_grows():
 
 
 def test_drives_are_measured():
-    rows = measured.headings(World("office", 1000), "", Configuration())
+    rows = measured.heading_errors(World("office", 1000), "", Configuration())
     assert len(rows) == 400
     assert np.abs(rows[:, 0]).max() < math.radians(1.5)
     assert np.abs(rows[:, 2]).max() > math.radians(5.0)

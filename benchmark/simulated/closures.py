@@ -126,7 +126,7 @@ class Paths:
 def closing_arcs(hypothesis: Hypothesis, before: HybridMap, examination: Examination | None) -> Iterator[Arc]:
     """The arcs of a hypothesis that place the robot in a known area.
 
-    They close a loop that its parent had not closed, or are measured anew by keyframes that TSBI found in the area.
+    They close a new loop, or have a new measurement by keyframes that TSBI matched with the area.
     """
     if hypothesis.removed_arcs:
         return  # a revision by TLCA, without an observation

@@ -167,7 +167,7 @@ class Watch:
             )
         event = hypotheses.sequence
         position = {"event": event, "stamp": self.truth.stamps[event], "traveled": self.traveled[event]}
-        self.pmf.append(position | {"unexamined": hypotheses.unexamined, "leaves": entries})
+        self.pmf.append(position | {"unexamined": hypotheses.unexamined, "hypotheses": entries})
 
     def _add_decision(self, decision: ClosureDecision) -> None:
         probabilities = dict(self._replica.probabilities)
