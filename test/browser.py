@@ -153,7 +153,7 @@ class Page:
         self.browser, self._listener, self._nodes = browser, listener, nodes
 
     def until(self, condition):
-        """Wait for it; the page is asked a few times a second."""
+        """Wait for it; the page is polled a few times a second."""
         asked = 0.0
 
         def due():

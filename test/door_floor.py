@@ -8,7 +8,7 @@ from hmt_slam_ros.simulation.building import FloorPlan
 from hmt_slam_ros.simulation.scenario import START
 
 ROOM = (4.0, 3.5)
-"""Where the robot was in the room of the first door; the last keyframe is up to half a metre before."""
+"""Where the robot was in the room of the first door; the last keyframe is up to half a meter before."""
 
 
 def write_world(folder):

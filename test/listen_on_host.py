@@ -1,4 +1,4 @@
-"""Beside the five processes on their host: hear all estimates, have the map saved, say what every node said last.
+"""Beside the five processes on their host: receive all estimates, have the map saved, print the last status of each node.
 
 A process of its own, as Fast DDS knows the network of the first participant of a process for all that follow.
 """
@@ -24,7 +24,7 @@ def main(domain, scans):
     health = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     print("listens", flush=True)
     try:
-        # What is lost may be asked for again after three seconds only, by Fast DDS's heartbeat.
+        # What is lost may be requested again after three seconds only, by Fast DDS's heartbeat.
         listener.until(lambda: len(estimates) == scans, seconds=PATIENCE)
         answer = listener.call(Trigger, "slam/save", Trigger.Request())
     finally:

@@ -83,7 +83,7 @@ class LossyLink:
 
 
 def _end(link):
-    """End the program that is the link, and print how many packets it carried."""
+    """End the program that is the link, and print how many packets it forwarded."""
     link.terminate()
     print(link.communicate()[0])
 
@@ -114,7 +114,7 @@ def _device(host):
 
 
 def carry(hosts, delay, jitter, loss):
-    """Carry packets between the hosts for ever."""
+    """Forward packets between the hosts for ever."""
     ends = [_device(host) for host in hosts]
     lost, number = 0, 0
 

@@ -23,7 +23,7 @@ def belief(pose, spread=SPREAD):
 
 
 class Play:
-    """TLCA with slam and TSBI played: keyframes are stored where the leaves say, one after another."""
+    """TLCA with slam and TSBI played: keyframes are stored where the hypotheses are, one after another."""
 
     def __init__(self, refinement=0, **changes):
         options = {"accept_keyframes": 3, "accept_distance": 1.0, "accept_probability": 0.9} | changes
@@ -33,7 +33,7 @@ class Play:
         self.notices = []
 
     def step(self, *leaves, places=None, world=HOME, traveled=None):
-        """One keyframe event: ``places`` are (hypothesis, area, area_T_base) before it, ``leaves`` TSBI's answer.
+        """One keyframe event: ``places`` are (hypothesis, area, area_T_base) before it, ``hypotheses`` TSBI's answer.
 
         Without places the keyframe is at the origin of the robot's area, and is the first of an area that is new.
         """
@@ -69,7 +69,7 @@ class Play:
 
 
 def new_area(hypothesis, parent, probability, area, pose, source=0):
-    """A leaf whose newest keyframe leaves ``source`` for the new ``area`` at ``source_T_area``."""
+    """A hypothesis whose newest keyframe leaves ``source`` for the new ``area`` at ``source_T_area``."""
     arc = Arc(source, area, belief(pose))
     return Hypothesis(hypothesis, parent, probability, area, belief(se2.inverse(pose)), (), (arc,))
 

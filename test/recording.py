@@ -55,7 +55,7 @@ class Recording:
 
 
 def what_all_offer(offers):
-    """The profile that rosbag2 asks for."""
+    """The profile that rosbag2 requests."""
     reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
     latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
     return QoSProfile(

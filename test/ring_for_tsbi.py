@@ -40,7 +40,7 @@ STEP = np.diag([0.02, 0.02, math.radians(0.25)]) ** 2  # covariance of the odome
 
 
 def ring_drive(length):
-    """``length`` poses half a metre apart, counter-clockwise along the middle of the corridors from (3, 1)."""
+    """``length`` poses half a meter apart, counter-clockwise along the middle of the corridors from (3, 1)."""
     corners = np.array([[17.0, 1.0], [17.0, 11.0], [1.0, 11.0], [1.0, 1.0]])
     poses, here, corner = [], np.array([3.0, 1.0]), 0
     while len(poses) < length:

@@ -200,7 +200,7 @@ def test_a_robot_that_returns_over_an_arc_has_moved_into_the_known_area():
 
 
 def moves_about(process, poses):
-    """The areas that the robot is said to move into while it goes to and fro on known ground, at first in area 1."""
+    """The areas that the robot moves into while it goes to and fro on known ground, at first in area 1."""
     area, moves = 1, []
     for k, pose in enumerate(poses, start=answered_in_first_room(process)):
         leaf = estimate(0, area, se2.between(THERE[0], pose), stored=False)
@@ -227,7 +227,7 @@ def test_the_robots_own_keyframes_stay_where_they_are_and_become_known_ground():
     process = aam(confirmations=1, min_cluster=3)
     k, _, event = drive_back(process)
     process.handle(stay(k, 0, area=event.area))
-    # In room 0 again: its keyframes are known ground and cannot leave it, however few of them are asked for.
+    # In room 0 again: its keyframes are known ground and cannot leave it, however few of them are requested.
     for step, pose in enumerate(worlds.drive((4.0, 4.0), (4.0, 2.0)), start=k + 1):
         (answer,) = process.handle(keyframe(step, pose, estimate(0, 0, se2.between(THERE[0], pose))))
         cut = [event for event in answer.events if event.kind == "cut"]
@@ -257,7 +257,7 @@ def test_a_hypothesis_that_does_not_store_the_keyframe_is_not_cut():
         process.handle(stay(k, 0))
 
 
-def test_hypotheses_are_judged_each_by_its_own_map():
+def test_hypotheses_are_scored_each_by_its_own_map():
     process = aam()
     event, k = drive_until_cut(process)
     process.handle(Hypotheses(k, (into(1, event, k, 1, 0, 0.6), Hypothesis(2, 0, 0.4, 0))))

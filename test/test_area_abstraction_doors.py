@@ -13,13 +13,13 @@ from hmt_slam_ros.landmarks.landmarks import CONCAVE_CORNER, OPENING, ScanLandma
 from hmt_slam_ros.landmarks.opening_detection import LandmarkOpenings
 
 FEATURES = FeatureParameters()
-# Beams that tell nothing: so no landmark is missed.
+# Uninformative beams, so that no landmark is missed.
 BLIND = Rays(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, np.bool_))
 DOOR, OTHER = (3.2, 0.0, 0.0), (6.2, 0.0, 0.0)
 
 
 def shown(pose, openings, confidence=0.9, kind=OPENING):
-    """What a keyframe shows of openings, as landmarks with beams that tell nothing else."""
+    """What a keyframe shows of openings, as landmarks with uninformative beams otherwise."""
     poses = np.array([se2.between(pose, np.array(one)) for one in openings]).reshape(-1, 3)
     count = len(poses)
     covariances = np.tile(np.diag([0.02, 0.02, 0.01]) ** 2, (count, 1, 1))

@@ -76,7 +76,7 @@ def test_a_state_of_another_policy_goes_on_by_the_own_one():
 
 @pytest.mark.parametrize(("policy", "merged"), [("ncut", True), ("both", False)])
 def test_areas_with_an_opening_between_them_are_not_one(policy, merged):
-    """Played: a closure joins the two rooms, and by a radius of overlap of metres nothing separates them."""
+    """Played: a closure joins the two rooms, and by a radius of overlap of meters nothing separates them."""
     process = by_policy("both", ncut_threshold=0.5, portal_factor=0.01)
     event, k = drive_until_cut(process, THROUGH)
     poses = {i: se2.between(THROUGH[0], THROUGH[i]) for i in event.keyframes}

@@ -105,7 +105,7 @@ def test_every_scan_keeps_its_pose_relative_to_a_keyframe_that_is_there(rounds):
     assert away.max() < 0.3
 
 
-def test_a_record_instead_of_messages_tells_the_same(rounds):
+def test_a_record_gives_the_same_as_messages(rounds):
     assert rounds.kept < 100 < len(rounds.run.recorder.keyframes)
     folded = rounds.folding.finish(rounds.log_state.stamps)
     for name in ("trajectory", "online_trajectory", "odometry"):

@@ -41,7 +41,7 @@ PMF = [
 ]
 
 
-def test_hypotheses_are_told_by_the_loops_that_they_and_their_parents_closed():
+def test_hypotheses_are_classified_by_the_loops_that_they_and_their_parents_closed():
     moments = trace_hypotheses(PMF, 0)
     assert [moment.probabilities[RIGHT] for moment in moments] == [0.0, 0.5, 0.7, 0.97, 1.0]
     assert [moment.probabilities[WRONG] for moment in moments] == [0.0, 0.4, 0.3, 0.03, 0.0]
@@ -93,14 +93,14 @@ def swap(one):
     }
 
 
-def test_a_question_after_the_evidence_shows_nothing_alive_but_can_settle():
+def test_a_question_after_the_evidence_shows_nothing_alive_but_can_be_decided():
     verdict = judge_reentry(trace_hypotheses(PMF, 0), evidence=0)
     assert verdict.has_question
     assert not verdict.both_alive
     assert verdict.waited == pytest.approx(1.0)
 
 
-def test_nothing_asked_is_nothing_settled():
+def test_without_a_question_nothing_is_decided():
     verdict = judge_reentry(trace_hypotheses([entry(k, hypothesis(0, 0, 1.0)) for k in range(3)], 0), evidence=1)
     assert not verdict.has_question
     assert not verdict.is_decided_correctly
@@ -110,7 +110,7 @@ def reentry(by, verdict):
     return Reentry({}, {"by_odometry": by}, [], verdict)
 
 
-def test_requirements_hold_only_where_all_that_is_undecided_was_alive_and_all_is_settled():
+def test_requirements_hold_only_where_all_undecided_are_alive_and_all_are_decided_correctly():
     good = Verdict(True, 0.3, 0.7, 0.5, 0.7, 0.5, 1.0)
     late = Verdict(True, None, None, None, None, 0.0, 1.0)
     decided_unasked = reentry(1.0, Verdict(False, None, None, None, None, None, 0.0))
@@ -175,7 +175,7 @@ def test_a_world_without_identical_places_has_no_rivalry():
     assert find_rivalries(log, None, [Loop(1, 0.0, 0.0, 1.0, {1: (0,)})], {}) == []
 
 
-def test_it_is_told_how_much_path_the_true_place_needs_to_become_sure():
+def test_the_table_has_the_path_until_the_true_place_is_sure():
     slow = [entry(0, hypothesis(0, 0, 1.0)), entry(1, hypothesis(2, 0, 0.5, right=1), hypothesis(3, 0, 0.5, wrong=1))]
     slow += [entry(k, hypothesis(2, 2, min(1.0, 0.5 + 0.04 * k)), hypothesis(3, 3, max(0.0, 0.5 - 0.04 * k))) for k in range(2, 60)]
     moments = trace_hypotheses(slow, 0)

@@ -1,4 +1,4 @@
-"""A world that changes: what is asked for, and that it is measured on two visits."""
+"""A world that changes: the requirements, and a measurement of two visits."""
 
 import numpy as np
 import pytest
@@ -37,13 +37,13 @@ def visits(lasers=LASERS):
 @pytest.mark.parametrize(
     ("after", "new", "gone"), [(AFTER, 1.0, 0.0), (BEFORE, 0.0, 1.0), ([*BEFORE, AFTER[1]], 1.0, 1.0)]
 )
-def test_a_map_is_judged_by_what_is_new_and_what_is_gone(after, new, gone):
+def test_a_map_is_scored_by_what_is_new_and_what_is_gone(after, new, gone):
     found = score_changes([image_of(*BEFORE), image_of(*after)], [FRAME, FRAME], visits())
     assert (found.new, found.gone, found.kept) == (new, gone, 1.0)
     assert found.lengths == pytest.approx((1.05, 1.05), abs=0.11)
 
 
-def test_what_could_not_be_seen_is_not_asked_for():
+def test_hidden_surfaces_do_not_count():
     lasers_turned = LASERS + np.array([0.0, 0.0, np.pi])
     found = score_changes([image_of(*BEFORE), image_of(*BEFORE)], [FRAME, FRAME], visits(lasers_turned))
     assert np.isnan(found.gone)
@@ -55,7 +55,7 @@ def test_cells_far_from_all_walls_are_unexplained():
     assert unexplained_share(image_of(*BEFORE, person), FRAME, BEFORE) == pytest.approx(5 / 55)
 
 
-def test_what_falls_short_is_told():
+def test_what_falls_short_is_reported():
     good = Visit(0.9, 0.05, 0.99, 0.0, 0.001, 0.02, 0.08, (100, 120), (5.0, 5.0))
     assert all(
         requirement.met for requirement in requirements("quiet", [good], [100, 110, 112], [LocalizationVisit(True, 0.03, 0.09)])

@@ -74,10 +74,10 @@ def test_scans_and_stamps_stay_and_one_seed_gives_one_log(kind):
 
 @pytest.mark.parametrize(("kind", "factor"), [("noise-2x", np.sqrt(3.0)), ("noise-4x", np.sqrt(15.0))])
 @pytest.mark.parametrize("per_meter", [4, 40])
-def test_the_noise_over_a_metre_is_the_models_whatever_the_rate_of_the_readings(kind, factor, per_meter):
+def test_the_noise_over_a_meter_is_the_models_whatever_the_rate_of_the_readings(kind, factor, per_meter):
     distance = 2000
     errors = increments(degrade_log(straight(distance, distance * per_meter), kind, 0)) - [1.0 / per_meter, 0.0, 0.0]
-    # The lateral errors of the readings within one metre are of the frame of each, not turned by those before.
+    # The lateral errors of the readings within one meter are of the frame of each, not turned by those before.
     deviations = errors.reshape(distance, per_meter, 3).sum(axis=1).std(axis=0)
     np.testing.assert_allclose(deviations, factor * np.array([0.1, 0.1, np.radians(2.0)]), rtol=0.05)
 

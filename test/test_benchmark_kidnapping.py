@@ -1,4 +1,4 @@
-"""What is made of what a robot says that was carried while it drove."""
+"""Scores of kidnapped robots by their localization."""
 
 import math
 
@@ -34,7 +34,7 @@ def summarize(*states):
     ],
     ids=["noticed and found", "found in a wrong place first", "never noticed", "lost again"],
 )
-def test_a_drive_is_judged_by_what_the_robot_says(states, noticed, again, confident, wrong):
+def test_a_drive_is_scored_by_the_localization_of_the_robot(states, noticed, again, confident, wrong):
     found = summarize(*states)
     assert (found.noticed, found.again, found.confident, found.wrong) == (noticed, again, confident, wrong)
 
@@ -46,7 +46,7 @@ def test_a_confident_wrong_answer_and_one_that_comes_late_are_faults():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_robot_is_carried_once_and_its_wheels_do_not_notice(kind):
+def test_the_robot_is_kidnapped_once_without_odometry(kind):
     log = open_log(draw_drive("ring", kind, 1))
     drive = log.scenario.settings
     assert (drive.carried > 0.5) == (kind == "known")
@@ -65,7 +65,7 @@ def test_the_robot_is_carried_once_and_its_wheels_do_not_notice(kind):
     [("busy", "known", 1000), ("office", "unknown", 8)],
     ids=["among people", "where little but passed walls contradicts, keyframe by keyframe"],
 )
-def test_a_robot_notices_that_it_was_carried_and_finds_itself(world, kind, seed):
+def test_a_kidnapping_is_detected_and_the_robot_relocalized(world, kind, seed):
     found = drive_kidnapped(draw_drive(world, kind, seed))
     assert found.noticed <= SOON
     assert not found.wrong

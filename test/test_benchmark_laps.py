@@ -1,4 +1,4 @@
-"""Laps over known ground: what is asked for, and that it is measured on a run."""
+"""Laps over known ground: the requirements, and a measurement of a run."""
 
 import pytest
 
@@ -24,7 +24,7 @@ def laps(last, error=0.03, count=20):
         (Lap(10, 200, 200, 1_000_000, 250_000_000, 0, 1, 1.0), 0.04, "the error"),
     ],
 )
-def test_what_grows_is_told(last, error, unmet):
+def test_what_grows_is_reported(last, error, unmet):
     failed = [requirement.name for requirement in requirements("office", laps(last, error)) if not requirement.met]
     assert failed == ([] if unmet is None else [f"office, lap 3 to 20: growth of {unmet}"])
 

@@ -1,4 +1,4 @@
-"""Whether the nodes keep time is told by the stamps of DDS."""
+"""Latency of the nodes by the stamps of DDS."""
 
 import numpy as np
 import pytest

@@ -55,7 +55,7 @@ def test_the_enumeration_gives_every_way_its_share(drive):
 
 
 def test_with_enough_hypotheses_tsbi_says_what_the_enumeration_says(monkeypatch):
-    """Where hypotheses that say the same stay apart, as they do in the enumeration."""
+    """Where hypotheses that are equivalent stay apart, as they do in the enumeration."""
     monkeypatch.setattr(tsbi, "merge_equivalent", lambda _, log_weights: dict(enumerate(log_weights)))
     monkeypatch.setattr(oracle, "HYPOTHESES", (1, 2, 32))
     distances = compare_drive(VAGUE, WORLD, SEED, NOISE, ()).distances
@@ -64,7 +64,7 @@ def test_with_enough_hypotheses_tsbi_says_what_the_enumeration_says(monkeypatch)
     assert 0.0 < sum(distances[2]) < sum(distances[1])
 
 
-def test_making_one_of_hypotheses_that_say_the_same_moves_little_probability(monkeypatch):
+def test_making_one_of_hypotheses_that_are_equivalent_moves_little_probability(monkeypatch):
     monkeypatch.setattr(oracle, "HYPOTHESES", (32,))
     assert 0.0 < max(compare_drive(VAGUE, WORLD, SEED, NOISE, ()).distances[32]) < 0.05
 

@@ -1,4 +1,4 @@
-"""The measurement of the pilot's errands through nodes."""
+"""The measurement of the pilot's tasks through nodes."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ WORLD = "sim:institute,seed=0,people=0,laps=1"
 
 
 def run(end, text="go room 1: the robot is there", offset=(0.0, 0.0, 0.0), contacts=0):
-    """An errand that begins 10 m off, slam being told a pose that the robot is so far away from."""
+    """A task that begins 10 m off, with an initial pose that is wrong by an offset."""
     place = np.array([0.5, -0.5, 0.2])
     start = se2.compose(IN_MAP, place), se2.compose(se2.compose(IN_WORLD, place), np.array(offset))
     return TaskRun(text, np.array([(3.0, 14.0), end]), 20.0, contacts, [start])
@@ -28,7 +28,7 @@ def values(*errands):
     return {task.name: (task.value, task.met) for task in requirements(scored)}
 
 
-def test_an_errand_reaches_its_place_where_the_pilot_says_so_and_the_robot_is_there():
+def test_a_task_reaches_its_place_if_the_pilot_reports_it_and_the_robot_is_there():
     found = values(run((3.0, 4.2)))
     assert all(met for _, met in found.values())
     assert found["mean speed"][0] == pytest.approx(0.49)
@@ -37,14 +37,14 @@ def test_an_errand_reaches_its_place_where_the_pilot_says_so_and_the_robot_is_th
     assert values(run((3.0, 4.0), contacts=1))["contacts"] == (1.0, False)
 
 
-def test_what_slam_is_told_is_compared_in_the_frame_of_the_area():
+def test_initial_poses_are_compared_in_the_frame_of_the_area():
     scored = _score_task(BUILDING, run((3.0, 4.0), offset=(0.3, -0.4, 0.1)), "room 1")
     assert scored.starts == [(pytest.approx(0.5), pytest.approx(0.1))]
     assert [cell(scored) for _, cell in _COLUMNS[-2:]] == ["0.50", "5.7"]
     assert not values(run((3.0, 4.0), offset=(0.3, -0.4, 0.1)))["initialpose: largest error"][1]
 
 
-def test_the_robot_wakes_up_at_the_same_place_for_the_same_building():
+def test_the_robot_starts_at_the_same_place_for_the_same_building():
     first, second = (_draw_start(WORLD, np.random.default_rng([0, 3])) for _ in range(2))
     assert first == second
 

@@ -57,7 +57,7 @@ def test_what_is_near_counts_and_what_is_nowhere_does_not():
     assert math.isnan(share_within([record([], [])], "doors", 1.0))
 
 
-def test_a_policy_is_judged_by_doors_closures_and_the_error_by_ncut():
+def test_a_policy_is_scored_by_doors_closures_and_the_error_by_ncut():
     good, bad = record([0.2], [0.1], error=0.105), record([2.0], [1.0], wrong=1, error=0.2)
     met = {"both": [good], "other": [bad], "ncut": [record([None], [])]}
     assert [one.met for one in requirements("both", met)] == [True] * 5
@@ -65,7 +65,7 @@ def test_a_policy_is_judged_by_doors_closures_and_the_error_by_ncut():
 
 
 @pytest.mark.parametrize(("policy", "found"), [("ncut", False), ("both", True)])
-def test_areas_end_at_the_doors_that_a_robot_passes_where_they_are_asked_to(policy, found):
+def test_areas_end_at_the_doors_that_a_robot_passes_where_they_have_to(policy, found):
     doors = observe_world(OFFICE, (f"aam.area_policy={policy}",))["doors"]
     assert len(doors["doors"]) == 1
     assert [distance <= 1.0 for distance in doors["doors"]] == [found]

@@ -1,4 +1,4 @@
-"""Reports, the tables in the documents, the logs that are measured on, and what a run is said to cost."""
+"""Reports, the tables in the documents, the logs that are measured on, and what a run costs."""
 
 import json
 import lzma

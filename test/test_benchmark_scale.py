@@ -1,4 +1,4 @@
-"""The lattices that scale is measured in, the robot that leaves them and comes back, and what is asked for."""
+"""The lattices that scale is measured in, the robot that leaves them and comes back, and the requirements."""
 
 import numpy as np
 import pytest
@@ -60,7 +60,7 @@ def test_what_a_stored_area_takes_is_poses_arcs_and_scans():
     assert area.whole == area.graph + area.scans
 
 
-def test_the_longest_cut_and_the_growth_of_a_scans_cost_are_judged():
+def test_the_longest_cut_and_the_growth_of_a_scans_cost_are_scored():
     cuts = [Cut(30.0, 0, 1, 0.0), Cut(101.0, 3, 2, 0.0)]
     assert not cut_requirement(10_000, cuts).met
     assert cut_requirement(100_000, cuts).met

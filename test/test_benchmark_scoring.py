@@ -1,4 +1,4 @@
-"""Scoring from output folders: what is asked for is met by good trajectories, and missed by bad ones."""
+"""Scoring from output folders: requirements are met by good trajectories, and missed by bad ones."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ SECONDS = np.arange(0.0, 200.0, 1.0)
 
 
 def line(error=0.0):
-    """A drive along x at 1 m/s, whose every metre is too long by ``error``."""
+    """A drive along x at 1 m/s, whose every meter is too long by ``error``."""
     poses = np.stack([(1.0 + error) * SECONDS, 0.0 * SECONDS, 0.0 * SECONDS], axis=1)
     return StampedPoses((SECONDS * 1e9).astype(np.int64), poses)
 

@@ -1,4 +1,4 @@
-"""What is true of a simulated run: claims, loops, and that watching a run changes nothing of it."""
+"""What is true of a simulated run: placements, loops, and that watching a run changes nothing of it."""
 
 import csv
 
@@ -24,7 +24,7 @@ TIGHT = 1e-4 * np.eye(3)
 
 
 def keyframes_of(log, spacing=10):
-    """Keyframe events of every so many scans of a drive, without leaves."""
+    """Keyframe events of every so many scans of a drive, without hypotheses."""
     scans = [r.measurement for r in log.records() if isinstance(r.measurement, Scan)][::spacing]
     path = log.true_poses(np.array([scan.stamp for scan in scans]))
     traveled = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
@@ -64,7 +64,7 @@ def second_lap(truth, keyframes):
 
 
 def claim_with_error(truth, known, asked, error, covariance=TIGHT):
-    """The claim that joins the frames of two keyframes, moved by an error."""
+    """The placement that joins the frames of two keyframes, moved by an error."""
     pose = se2.compose(se2.between(truth.poses[known], truth.poses[asked]), np.array(error))
     return truth.claim({known: np.zeros(3)}, {asked: pose}, covariance, pose)
 
@@ -75,7 +75,7 @@ def test_the_long_world_is_2_km_of_nested_loops_and_no_family():
     assert LONG not in FAMILIES
 
 
-def test_a_claim_is_true_where_the_places_meet_as_it_says(drive):
+def test_a_placement_is_true_where_the_places_meet(drive):
     truth, keyframes = drive
     known, asked = second_lap(truth, keyframes)
     exact = claim_with_error(truth, known, asked, (0.0, 0.0, 0.0))
@@ -84,13 +84,13 @@ def test_a_claim_is_true_where_the_places_meet_as_it_says(drive):
     assert exact.translation == pytest.approx(0.0, abs=1e-9)
     assert claim_with_error(truth, known, asked, (0.45, 0.0, 0.1)).true
     assert not claim_with_error(truth, known, asked, (0.0, 0.0, 0.2)).true
-    # Up to 2 m where the claim says itself that it does not know better.
+    # Up to 2 m where its covariance admits the error.
     assert not claim_with_error(truth, known, asked, (1.5, 0.0, 0.0)).true
     assert claim_with_error(truth, known, asked, (1.5, 0.0, 0.0), np.diag([1.0, 0.01, 0.01])).true
     assert not claim_with_error(truth, known, asked, (2.5, 0.0, 0.0), np.diag([4.0, 0.01, 0.01])).true
 
 
-def test_a_claim_that_joins_what_is_apart_is_false_however_right_its_pose(drive):
+def test_a_placement_that_joins_what_is_apart_is_false_however_right_its_pose(drive):
     truth, keyframes = drive
     far = next(k.sequence for k in keyframes if k.path_length > 20.0)
     claim = claim_with_error(truth, 0, far, (0.0, 0.0, 0.0))
@@ -161,7 +161,7 @@ def test_a_record_holds_what_the_four_measurements_need(record):
     assert len(watched["rows"][0]) == len(watched["columns"])
 
 
-def test_a_record_is_made_once_and_anew_for_other_parameters(record):
+def test_a_record_is_made_once_and_again_for_other_parameters(record):
     folder, watched = record
     path = folder / "ring-5.json.gz"
     before = path.stat().st_mtime_ns

@@ -1,4 +1,4 @@
-"""What a long run of the nodes is asked for."""
+"""Requirements on a long run of the nodes."""
 
 import math
 

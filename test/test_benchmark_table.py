@@ -33,7 +33,7 @@ def method(particles, cpu, peak, long_error, name="metric RBPF", worst=0.5):
 OURS = method(12, 10.0, 200.0, 0.1, "HMT-SLAM")
 
 
-def test_accuracy_is_equal_up_to_a_factor_or_a_centimetre():
+def test_accuracy_is_equal_up_to_a_factor_or_a_centimeter():
     assert method(12, 1.0, 1.0, 0.125).as_accurate_as(OURS)
     assert not method(12, 1.0, 1.0, 0.126).as_accurate_as(OURS)
     assert method(12, 1.0, 1.0, 0.029).as_accurate_as(method(12, 1.0, 1.0, 0.02))
@@ -43,7 +43,7 @@ def test_accuracy_is_equal_up_to_a_factor_or_a_centimetre():
 @pytest.mark.parametrize(
     ("last", "met"), [((100, 40.0, 600.0, 0.1), [True] * 3), ((40, 39.0, 599.0, 0.9), [True, False, False])]
 )
-def test_the_campus_asks_for_ratios_of_the_last_filter_that_was_tried(last, met):
+def test_the_campus_requests_ratios_of_the_last_filter_that_was_tried(last, met):
     found = Comparison(OURS, (method(12, 11.0, 220.0, 1.0), method(*last)), {}, "truth")
     assert [asked.met for asked in requirements(found)] == met
     assert ("not as accurate" in requirements(found)[1].name) == (not found.equal)
@@ -58,7 +58,7 @@ def test_a_metric_run_has_a_map_that_holds_the_log_and_its_own_particles():
     assert case.name != metric_case(LOG, 3, (), 100).name
 
 
-def test_a_run_is_kept_and_made_anew_for_another_program(tmp_path, monkeypatch):
+def test_a_run_is_kept_and_made_again_for_another_program(tmp_path, monkeypatch):
     runs = []
 
     def run_case(case, folder):

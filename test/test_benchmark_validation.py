@@ -48,7 +48,7 @@ def test_a_forecast_without_the_true_answer_is_as_bad_as_can_be_but_finite():
 
 EVENT = {
     "answers": [answer(2, 0.9, True), answer(NEW, 0.1, False)],
-    # Two hypotheses of 0.8 and 0.15, of which the first asked about two areas, and one of 0.05 that did not ask.
+    # Two hypotheses of 0.8 and 0.15, of which the first examined two areas, and one of 0.05 that did not.
     "arcs_alone": [
         answer(NEW, 0.4, False),
         answer(2, 0.3, True),
@@ -65,7 +65,7 @@ def test_the_other_forecasters_see_no_scan():
     base = forecast_of_base_rate(EVENT, 0.6)
     assert base.right == pytest.approx(0.8 * 0.2 + 0.05)
     assert sum(base.wrong) == pytest.approx(1.0 - base.right)
-    # New ground: 60 % of what asked about areas, and all of what had none to ask about.
+    # New ground: 60 % of what examined areas, and all of what had none to examine.
     assert max(base.wrong) == pytest.approx(0.8 * 0.6 + 0.15)
     assert new_rate([EVENT]) == 0.0
 
@@ -149,7 +149,7 @@ def test_the_document_has_a_place_for_every_measurement(kind):
 
 
 def test_all_is_measured_on_a_world_of_the_training_seeds(tmp_path, capsys):
-    """Seed 0 of one family: far too few runs for what is asked for, and that is said."""
+    """Seed 0 of one family: far too few runs for the requirements, which is reported."""
     out, runs = tmp_path / "report", tmp_path / "runs"
     options = ["--logs", "ring", "--seeds", "1", "--training", "--jobs", "1", "--out", str(out), "--runs", str(runs)]
     assert main(["calibration", "loops", "consistency", *options]) == 1

@@ -1,4 +1,4 @@
-"""Maps that close are told from torn ones, without any truth."""
+"""Maps that close are distinguished from torn ones, without any truth."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from worlds import box, scan_in
 from benchmark.scoring import judge_walls
 from hmt_slam_ros.geometry import se2
 
-ROUND = 24  # poses of one round, a metre apart
+ROUND = 24  # poses of one round, a meter apart
 
 
 @pytest.fixture(scope="module")
@@ -42,14 +42,14 @@ def test_a_second_round_beside_the_first_is_torn(ring, shift):
     assert walls.agreement < 0.6
 
 
-def test_the_way_back_to_where_a_torn_stretch_fits_is_told(ring):
+def test_the_way_back_to_where_a_torn_stretch_fits_is_reported(ring):
     scans, poses = ring
     moved = poses + np.where(np.arange(len(poses)) >= ROUND, 0.4, 0.0)[:, None] * [1.0, 0.0, 0.0]
     (worst, *_) = sorted(judge_walls(scans, moved).torn, key=lambda stretch: -stretch.gain)
     assert worst.shift == pytest.approx(0.4, abs=0.11)
 
 
-def test_new_ground_is_not_judged(ring):
+def test_new_ground_is_not_scored(ring):
     scans, poses = ring
     walls = judge_walls(scans[:ROUND], poses[:ROUND])
     assert walls.stretches == ()

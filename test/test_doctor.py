@@ -96,7 +96,7 @@ def test_nor_in_another_world_with_people_and_a_laser_ahead(seed):
 
 
 @pytest.mark.parametrize("seed", (0, 1))
-def test_where_the_laser_reaches_nothing_only_that_is_told(seed):
+def test_where_the_laser_reaches_nothing_only_that_is_reported(seed):
     log = open_log(f"sim:hall,seed={seed},beams=181", duration=60.0)
     assert subjects(log) == {"few returns": "wrong"}
 
@@ -264,7 +264,7 @@ def test_stamps_that_jump_back_or_stay_are_found(drive):
     assert "once, by up to 0.100 s" in text_of(log, "scan stamps jump back")
 
 
-def test_a_robot_that_stands_is_not_judged(drive):
+def test_a_robot_that_stands_is_not_scored(drive):
     scan = next(record.measurement for record in drive if is_scan(record))
     log = changed(
         drive[:400],

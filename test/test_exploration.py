@@ -79,7 +79,7 @@ class _Explored:
 
 @cache
 def explored(number: int = 0) -> _Explored:
-    """One and the same exploration for all tests that ask for this number."""
+    """One and the same exploration for all tests that request this number."""
     del number
     return _Explored()
 
@@ -117,7 +117,7 @@ def test_rooms_have_names_and_the_robot_goes_there() -> None:
     assert own.robot.contacts == 0
 
 
-def test_backtracking_goes_along_its_own_path_until_told_to_stop() -> None:
+def test_backtracking_goes_along_its_own_path_until_stopped() -> None:
     own = explored(1)
     at = len(path_of(own))
     assert own.run.do(Task("backtrack"), 12.0) is None
@@ -157,7 +157,7 @@ def test_it_turns_back_while_several_topological_paths_are_probable() -> None:
     assert np.hypot(*on.pose[:2]) > 1.0
 
 
-def test_it_explores_on_where_nobody_asks_it_to_turn_back() -> None:
+def test_it_explores_on_where_nobody_requests_it_to_turn_back() -> None:
     own = _Explored(explore=False)
     assert own.run.do(Task("explore"), 25.0) is None
     assert own.run.driver.exploration_map.entropy == 0.0
@@ -182,7 +182,7 @@ def test_scans_may_come_after_any_message_of_the_chain() -> None:
     assert new in atlas.keyframe_locator
 
 
-def test_unknown_places_are_told() -> None:
+def test_unknown_places_are_reported() -> None:
     outcome = done(explored().run.do(Task("go", "cellar"), 5.0))
     assert not outcome.succeeded
     assert "choose from room 1, room 2, area 0" in outcome.text
@@ -303,7 +303,7 @@ def test_a_room_behind_a_gap_in_a_room_is_part_of_it() -> None:
     plan = FloorPlan()
     plan.cut_rectangle(0.0, -1.0, 12.0, 1.0)
     plan.cut_rectangle(4.5, -1.3, 5.5, -0.9)
-    # Two cupboards leave a gap of a metre in the middle of the room.
+    # Two cupboards leave a gap of a meter in the middle of the room.
     plan.cut_rectangle(3.0, -4.0, 7.0, -1.2)
     plan.cut_rectangle(4.5, -4.4, 5.5, -3.9)
     plan.cut_rectangle(3.0, -8.0, 7.0, -4.3)
@@ -359,7 +359,7 @@ def test_no_progress_for_long_is_noticed(seconds: float, stuck: bool) -> None:
     assert pilot.is_stuck(1 + round(seconds * NANOSECONDS), 15 * NANOSECONDS) == stuck
 
 
-def test_errands_as_they_are_written() -> None:
+def test_tasks_as_they_are_written() -> None:
     assert parse_task("explore", EXPLORER_TASKS) == Task("explore")
     assert parse_task(" go room 3", EXPLORER_TASKS) == Task("go", "room 3")
     for text in ("go", "dance", "explore room 3", ""):

@@ -131,7 +131,7 @@ def test_it_reaches_goals_in_floors_with_people_without_contact(seed):
 
 
 @pytest.mark.parametrize("laser", ["360°", "180°"])
-def test_it_passes_doors_of_ninety_centimetres(laser):
+def test_it_passes_doors_of_ninety_centimeters(laser):
     legs = list(drive_goals(scenario_of("doors", 4, laser), 8))
     assert all(leg.reached for leg in legs)
     assert sum(leg.contacts for leg in legs) == 0

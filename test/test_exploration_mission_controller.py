@@ -134,7 +134,7 @@ def test_a_robot_that_sees_nothing_goes_on_and_waits_for_walls(known):
 
 def test_where_the_belief_is_wrong_there_is_no_door_and_the_robot_goes_on(known):
     goal = destinations(known)[node_at(known, 5.0)]
-    # It believes to be before the door, and is 2 m off.
+    # It is certain to be before the door, and is 2 m off.
     belief = certain_belief(known.graph, CONFIGURATION.places, state_of(goal.node, eastwards(known)))
     robot = Robot(MissionController(known, CONFIGURATION, LIMITS, belief), (7.0, 0.0, 0.0))
     phases = list(robot.go(goal))

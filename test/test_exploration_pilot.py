@@ -32,7 +32,7 @@ def saved():
 
 
 class Robot:
-    """It does what it is told, and RTL tells where it is: always, from the door on, never, or elsewhere.
+    """It follows commands, and RTL gives its pose: always, from the door on, never, or elsewhere.
 
     RTL that is lost has it in an area that the map has not.
 
@@ -85,7 +85,7 @@ class Robot:
         return said
 
     def do(self, text, steps=600):
-        """How an errand ends."""
+        """How a task ends."""
         said = self.hear(parse_task(text, PILOT_TASKS))
         for _ in range(steps):
             for answer in said:
@@ -134,7 +134,7 @@ def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_unti
     assert robot.do(f"go {room}").succeeded
 
 
-def test_metric_slam_that_has_the_robot_at_the_door_is_told_nothing(saved):
+def test_metric_slam_that_has_the_robot_at_the_door_gets_no_initial_pose(saved):
     missions = PilotProcess(CONFIGURATION, saved)
     robot = Robot(missions, (12.0, 0.0, math.pi))
     assert robot.do(f"go {the_room(missions)}").succeeded
@@ -154,7 +154,7 @@ def test_a_robot_that_metric_slam_does_not_find_behind_the_door_goes_by_the_map_
     assert math.dist(robot.pose[:2], place[:2]) < 0.2
 
 
-def test_where_metric_slam_has_the_robot_elsewhere_the_belief_begins_anew_and_no_door_is_entered(saved):
+def test_where_metric_slam_has_the_robot_elsewhere_the_belief_restarts_and_no_door_is_entered(saved):
     missions = PilotProcess(CONFIGURATION, saved)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="elsewhere"), the_room(missions)
     robot.hear(parse_task(f"go {room}", PILOT_TASKS))
@@ -194,7 +194,7 @@ def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_onc
     assert not any(isinstance(message, VelocityCommand) for message in robot.said)
 
 
-def test_it_finds_out_where_it_is_and_stops_when_told_or_when_it_takes_too_long(saved):
+def test_it_finds_out_where_it_is_and_stops_on_request_or_when_it_takes_too_long(saved):
     missions = PilotProcess(with_changes(CONFIGURATION, {"pilot.task_timeout": 2.0}), saved)
     robot = Robot(missions, (14.0, 0.0, math.pi), rtl="never")
     assert robot.do("localize").text == "localize: given up after 2 s"

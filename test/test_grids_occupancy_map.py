@@ -62,7 +62,7 @@ def test_a_beam_crosses_the_cells_that_a_fine_walk_along_it_meets() -> None:
 
 
 @pytest.mark.parametrize("value", [20.0, 25.0, np.nan, np.inf, 0.0, 0.05, -1.0])
-def test_a_beam_without_a_return_says_nothing(value: float) -> None:
+def test_a_beam_without_a_return_has_no_information(value: float) -> None:
     image = drawn([beam(1.0, value, increment=np.pi / 2)], [AHEAD])
     assert (image.pixels == OCCUPIED).sum() == 1
     assert colour(image, 0.05, 0.35) == UNKNOWN

@@ -74,7 +74,7 @@ def test_the_corner_of_a_pillar_points_at_the_robot():
     np.testing.assert_allclose(convex[0], [1.0, 1.0, -0.75 * np.pi], atol=0.02)
 
 
-def test_corners_are_as_far_off_as_they_say():
+def test_corners_are_as_far_off_as_stated():
     nees = []
     for seed in range(60):
         pose = np.array([np.sin(seed), 0.5 * np.cos(seed), 0.7 * seed])
@@ -153,7 +153,7 @@ def test_a_gap_beside_furniture_is_hardly_an_opening():
     assert away.max() < 0.05 and openings.confidences[door] > 0.8
 
 
-def test_openings_are_as_far_off_as_they_say():
+def test_openings_are_as_far_off_as_stated():
     nees = []
     for seed in range(40):
         pose = np.array([2.5 + 0.01 * seed, 0.2 * np.sin(seed), 0.3 * seed])

@@ -1,4 +1,4 @@
-"""The lines that scans show, as certain as they say."""
+"""The lines that scans show, as certain as stated."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def in_room(lines, pose):
 
 
 @pytest.mark.parametrize(("beams", "field_of_view"), [(91, np.pi), (361, np.pi), (1081, 1.5 * np.pi), (100, 1.0)])
-def test_lines_are_as_far_off_as_they_say(beams, field_of_view):
+def test_lines_are_as_far_off_as_stated(beams, field_of_view):
     nees = []
     for seed in range(100):
         pose = np.array([np.sin(seed), 0.5 * np.cos(seed), 0.7 * seed])

@@ -81,7 +81,7 @@ def test_a_step_tells_what_the_match_determines(mapping):
 
 
 @pytest.mark.parametrize("slip", [-35.0, 35.0])
-def test_a_heading_slip_is_found_by_inertia_and_told(mapping, slip):
+def test_a_heading_slip_is_found_by_inertia_and_reported(mapping, slip):
     own, truth, _ = driven(mapping, steps=21)
     truth = se2.compose(truth, STEP)
     slipped = se2.compose(STEP, (0.0, 0.0, np.radians(slip)))
@@ -152,7 +152,7 @@ def test_keyframes_are_dropped_and_what_was_known_is_forgotten(mapping):
     np.testing.assert_allclose(own.line_map.pose.covariance, SURE, atol=1e-12)
 
 
-def test_keyframes_of_a_drift_are_corrected_and_told(mapping):
+def test_keyframes_of_a_drift_are_corrected_and_reported(mapping):
     # A hallway whose end comes into sight only near it, as it does behind people.
     hallway = box(-2.0, -1.0, 12.0, 1.0)
     own, truth, ahead = FilterSelector(mapping).new(0, 0), np.zeros(3), np.array([0.1, 0.0, 0.0])

@@ -17,7 +17,7 @@ ARC = np.array([2.25, 0.0, 0.5 * np.pi])
 
 
 def driven(xs=None, first=0, second=1):
-    """A drive along x, half a metre to a keyframe, five of which are in the first area."""
+    """A drive along x, half a meter to a keyframe, five of which are in the first area."""
     hybrid_map = HybridMap()
     frames = {0: np.zeros(3), 1: ARC}
     xs = 0.5 * np.arange(10) if xs is None else xs

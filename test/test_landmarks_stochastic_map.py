@@ -46,7 +46,7 @@ def line_covariance(room, line):
     return room.covariance[own, own]
 
 
-def test_pose_and_lines_are_as_far_off_as_they_say():
+def test_pose_and_lines_are_as_far_off_as_stated():
     deviations, poses, lines = np.array([0.05, 0.05, 0.03]), [], []
     for seed in range(60):
         draw = np.random.default_rng(seed)
@@ -67,7 +67,7 @@ def test_pose_and_lines_are_as_far_off_as_they_say():
     assert 1.5 < np.mean(lines) < 2.6
 
 
-def test_a_motion_and_a_new_line_carry_uncertainty_as_first_order_says():
+def test_a_motion_and_a_new_line_propagate_uncertainty_as_first_order_says():
     start = PoseGaussian(np.array([0.7, -0.4, 0.6]), np.diag([0.01, 0.02, 0.005]) ** 2)
     step = RelativeMotion(np.array([0.5, 0.1, 0.3]), np.diag([0.02, 0.01, 0.01]) ** 2)
     room = LineMap(FEATURES, start)
@@ -104,7 +104,7 @@ def test_a_wall_has_two_faces_and_in_its_plane_noise_does_not_tell_which():
     assert np.linalg.eigvalsh(room.covariance).min() > 0.0
 
 
-def test_what_may_be_either_of_two_lines_is_told_by_the_others():
+def test_what_may_be_either_of_two_lines_is_decided_by_the_others():
     """The recess of a door is nearer to where the wall is predicted than the wall; the wall across the room tells."""
     walls = np.array([[0.0, 4.0], [0.0, 4.08], [-np.pi, 2.0]])
     room = LineMap(FEATURES)
@@ -185,7 +185,7 @@ def test_a_scan_without_lines_changes_nothing():
 
 
 @pytest.mark.parametrize("kind", ["room", "busy office"])
-def test_a_simulated_room_is_mapped_to_the_centimetre(kind):
+def test_a_simulated_room_is_mapped_to_the_centimeter(kind):
     drive = map_rooms(kind, 3, "laps=1,rate=2,field_of_view=360,beams=360", Configuration())
     assert drive.pose_nees.mean() < 9.0
     assert 2.0 * drive.pose_sigmas[:, :2].mean() < 0.01

@@ -71,7 +71,7 @@ def test_a_view_of_a_laser_that_hangs_upside_down_or_moves_in_the_sweep_is_the_s
     assert classify_points(to_polar_scan(moving), places).tolist() == [SURFACE, FREE, UNKNOWN]
 
 
-def test_an_unchanged_room_is_no_news():
+def test_an_unchanged_room_has_no_changes():
     found = news(room(CUPBOARD), room(CUPBOARD))
     assert (found.has_new_surface, found.has_changed_surface) == (False, False)
     assert not any(late.seen_through.any() or late.starts.any() for late in found.stale_beams.values())
@@ -98,7 +98,7 @@ def test_of_furniture_that_is_gone_every_beam_is_out_of_date():
         assert (on == gone).mean() > 0.98
 
 
-def test_who_walks_through_is_no_news():
+def test_a_person_who_walks_through_is_no_change():
     """A person as wide as the cupboard, elsewhere at every look."""
     at = [box(x, -1.0, x + 0.4, -0.6) for x in (1.0, 1.6, 2.2)]
     found = news(room(), room(box(2.8, -1.0, 3.2, -0.6)), looks_in(*(room(person) for person in at)))
@@ -213,7 +213,7 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
         assert (starts >= np.float32(one.starts)).all()
 
 
-def test_a_run_that_goes_on_from_its_state_says_the_same(visits):
+def test_a_run_that_goes_on_from_its_state_is_the_same(visits):
     _, folder, rest, said, _ = visits
     middle, _ = read_run_state(folder)
     assert any(live.event.recent_scans for live in middle.processes["slam"].live_hypotheses.values())

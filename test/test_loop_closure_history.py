@@ -1,4 +1,4 @@
-"""Topological Loop Closure Acceptance: closures are aligned, spread over loops, doubted on contradiction."""
+"""Topological Loop Closure Acceptance: closures are aligned, spread over loops, revised on contradiction."""
 
 from dataclasses import replace
 
@@ -88,13 +88,13 @@ def test_an_arc_found_between_areas_that_keep_their_keyframes_is_finely_aligned(
     assert abs(np.degrees(off[2])) < 0.3
 
 
-def test_a_closure_that_claims_to_be_certain_is_not_moved_beyond_its_gate():
+def test_a_closure_with_a_large_certainty_is_not_moved_beyond_its_gate():
     error = np.array([0.2, -0.15, 0.0])
     _, verdict, *_ = closing_play(error, np.diag([0.01**2, 0.01**2, 0.005**2]))
     assert verdict.moved_keyframes == ()
 
 
-def test_a_loop_is_spread_over_its_arcs_or_left_open_as_asked_for():
+def test_a_loop_is_spread_over_its_arcs_or_left_open_as_requested():
     quarter = np.radians(88.0)
     step = [2.0, 0.0, quarter]
 
@@ -116,7 +116,7 @@ def test_a_loop_is_spread_over_its_arcs_or_left_open_as_asked_for():
     assert np.ptp(turns) > 5.0
 
 
-def test_an_arc_that_refuses_to_fit_is_told_once():
+def test_an_arc_that_refuses_to_fit_is_reported_once():
     play = Play()
     play.start()
     for area in (1, 2, 3):
@@ -156,7 +156,7 @@ def two_loops(play, false_closure):
     return play.step(Hypothesis(0, 0, 1.0, 4, None, (), (other,)))
 
 
-def test_a_contradiction_is_told_to_tsbi_and_the_map_is_not_bent_by_it():
+def test_a_contradiction_is_sent_to_tsbi_and_the_map_is_not_bent_by_it():
     play = Play(arc_sigma_floor=1e-4, arc_angle_floor=1e-3)
     before = two_loops(play, false_closure=True)
     assert before.hypothesis == 0

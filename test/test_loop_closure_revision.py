@@ -80,7 +80,7 @@ def doubt_of(account, event):
     )
 
 
-def test_closures_that_agree_raise_no_doubt():
+def test_closures_that_agree_raise_no_inconsistency():
     account = drive_with((80, 7, 0, (0.05, 0.0, 0.0)), (81, 6, 1, (0.0, -0.05, 0.0)), (82, 7, 2, (0.0, 0.0, 0.0)))
     assert doubt_of(account, 82) is None
 
@@ -360,7 +360,7 @@ def test_every_process_has_the_same_map_from_messages_alone(drives):
                 np.testing.assert_array_equal(arc.pose.mean, other.pose.mean)
 
 
-def test_a_true_closure_is_not_doubted(drives):
+def test_a_true_closure_is_not_rejected(drives):
     recording, _ = drives[0]
     assert [notice for notice in recording.notices if notice.process == "tlca"] == []
     assert any(arc.closure for _, _, arc in recording.hybrid_map.all_arcs())

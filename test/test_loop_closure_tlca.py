@@ -16,7 +16,7 @@ def test_the_first_area_lies_at_the_origin_of_the_map_with_hardly_any_uncertaint
     assert 0.0 < np.trace(poses_of(verdict)[0].covariance) < 1e-6
 
 
-def test_nothing_is_said_where_nothing_changed():
+def test_nothing_is_sent_where_nothing_changed():
     play = Play()
     play.start()
     verdict = play.step(places=[(0, 0, [0.5, 0.0, 0.0])])
@@ -48,7 +48,7 @@ def test_a_dominant_path_is_accepted_after_enough_keyframes_since_the_paths_part
     assert [play.step(*both()).hypothesis for _ in range(2)] == [None, 1]
 
 
-def test_a_dominant_path_is_accepted_after_enough_metres_since_the_paths_parted():
+def test_a_dominant_path_is_accepted_after_enough_meters_since_the_paths_parted():
     play = Play(accept_keyframes=1, accept_distance=2.0)
     assert parted(play).hypothesis is None  # parted at 0.5 m
     assert [play.step(*both(), traveled=t).hypothesis for t in (1.0, 2.4, 2.5)] == [None, None, 1]
@@ -67,7 +67,7 @@ def test_an_undecided_question_stays_open():
     assert all(play.step(*both(0.6)).hypothesis is None for _ in range(10))
 
 
-def test_branching_again_starts_the_count_anew():
+def test_branching_again_starts_the_count_again():
     play = Play(accept_distance=0.0)
     parted(play)
     play.step(*both())

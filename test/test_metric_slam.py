@@ -48,7 +48,7 @@ def agree(keyframe):
 
 
 class Dialogue:
-    """A metric SLAM process, and everything that it said."""
+    """A metric SLAM process, and all messages that it sent."""
 
     def __init__(self, configuration=None, answer=agree):
         self.slam = MetricSlam(configuration or Configuration())
@@ -80,7 +80,7 @@ def test_every_scan_gets_a_pose_near_the_truth():
     assert np.hypot(*errors[:, :2].T).max() < 0.05
 
 
-def test_a_keyframe_comes_with_every_half_metre():
+def test_a_keyframe_comes_with_every_half_meter():
     dialogue = Dialogue()
     for odometry, scan, _ in drive(61):
         dialogue.tell(odometry, scan)
@@ -124,7 +124,7 @@ def test_a_scan_waits_for_its_odometry():
     assert len(dialogue.of(LocalEstimate)) == 1
 
 
-def test_without_odometry_scans_are_matched_after_a_while_and_it_is_said_once():
+def test_without_odometry_scans_are_matched_after_a_while_and_it_is_reported_once():
     configuration = Configuration()
     configuration = replace(configuration, filter=replace(configuration.filter, max_scans_waiting_for_odometry=5))
     dialogue = Dialogue(configuration)
@@ -137,7 +137,7 @@ def test_without_odometry_scans_are_matched_after_a_while_and_it_is_said_once():
     assert np.abs(dialogue.of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.1
 
 
-def test_stamps_that_jump_back_lose_no_scan_and_are_said_once():
+def test_stamps_that_jump_back_lose_no_scan_and_are_reported_once():
     dialogue = Dialogue()
     for k, (odometry, scan, _) in enumerate(drive(30)):
         stamp = scan.stamp - (SECOND // 2 if k in (10, 20) else 0)
@@ -294,7 +294,7 @@ def test_two_hypotheses_are_tracked_side_by_side():
 
 
 def test_a_robot_that_takes_itself_for_lost_goes_on_by_odometry():
-    """It may be wrong about that, so that it is drawn where it is if nobody carried it."""
+    """The kidnapping may be a false alarm, so that the robot is drawn at its pose without it."""
 
     def lost_at_the_third(keyframe):
         lost = keyframe.sequence == 2

@@ -27,7 +27,7 @@ SCANS = 160
 
 
 def true_pose(seconds):
-    """``world_T_base`` (n, 3) on a round of straight metres and quarter circles, each of one second."""
+    """``world_T_base`` (n, 3) on a round of straight meters and quarter circles, each of one second."""
     corners = [np.zeros(3)]
     for second in range(SCANS // 10 + 1):
         corners.append(se2.compose(corners[-1], se2.exp(twist(second))))
@@ -125,7 +125,7 @@ def test_at_the_end_of_a_log_the_last_sweep_goes_on_as_the_odometry_did():
     np.testing.assert_allclose(dialogue.of(Keyframe)[0].scan.motion, (0.09, 0.0, 0.0), atol=1e-9)
 
 
-def test_an_impossible_time_increment_is_said_once_and_no_scan_is_lost():
+def test_an_impossible_time_increment_is_reported_once_and_no_scan_is_lost():
     dialogue = Dialogue()
     for k in range(10):
         stamp = SECOND + k * SECOND // 10

@@ -124,7 +124,7 @@ def test_a_run_in_which_closures_were_accepted_and_areas_became_one_can_stop(tmp
     assert len(stopped) == 3
 
 
-def test_a_run_in_which_a_closure_is_doubted_can_stop_before_the_question_is_answered(tmp_path):
+def test_a_run_in_which_a_closure_is_revised_can_stop_before_the_question_is_answered(tmp_path):
     log = open_log("sim:ring,seed=3,size=1.5", duration=165.0)
     (stopped,) = compared(log, tmp_path, once(lambda state: state.revised_hypotheses), lambda: misled(2, 0, 3.8))
     assert [ends.source for ends in stopped.revised_hypotheses[0].removed_arcs] == [0]
@@ -231,7 +231,7 @@ def test_a_log_that_goes_on_begins_where_it_began_and_a_further_one_anywhere():
         describe_parameter_changes(saved, asked)
 
 
-def test_parameters_that_may_change_are_told_with_both_values():
+def test_parameters_that_may_change_are_reported_with_both_values():
     saved = with_changes(Configuration(), {"tlca.accept_probability": 0.9, "robot.duration": 60.0})
     assert describe_parameter_changes(saved, with_changes(saved, {"robot.duration": 0.0})) is None
     told = describe_parameter_changes(saved, with_changes(saved, {"tlca.accept_probability": 0.95, "seed": 4}))

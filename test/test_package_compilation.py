@@ -1,4 +1,4 @@
-"""That kernels are being compiled is said where it is so, and only there."""
+"""That kernels are being compiled is reported where it is so, and only there."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ for _ in range(2):
     report_compilation(print)
 {use}
 """
-"""It asks twice, as a node does that is taken down and brought up again."""
+"""It checks twice, as a node does that is taken down and brought up again."""
 LOAD = "import numpy as np; from hmt_slam_ros.grids.distance_field import has_bits"
 USE = "has_bits(np.zeros(3, np.uint32)); has_bits(np.zeros((1, 3), np.uint32)[0, ::2])"
 

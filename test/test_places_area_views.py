@@ -86,7 +86,7 @@ def test_what_an_area_shows_in_two_maps_is_kept_for_both(area, looked_up):
     assert len(looked_up) == 2 * len(keyframes)
 
 
-def test_where_keyframes_moved_or_were_taken_out_it_is_looked_up_anew(area, looked_up):
+def test_where_keyframes_moved_or_were_taken_out_it_is_looked_up_again(area, looked_up):
     keyframes, scans = area
     own = views(scans)
     own.area_view(0, keyframes)

@@ -144,7 +144,7 @@ def test_peaks_may_head_for_different_sides_but_have_to_move_alike_and_apart(hal
     assert proposals(hallway, stuck) == [None] * 5
 
 
-def test_a_belief_that_is_certain_and_one_of_many_peaks_begin_anew(hallway):
+def test_a_belief_that_is_certain_and_one_of_many_peaks_restart(hallway):
     pairs = [(state_of(k, EAST), state_of(k + 6, EAST)) for k in range(5)]
     detector = TwoPeakTracker()
     for k, pair in enumerate(pairs):

@@ -110,7 +110,7 @@ def test_the_way_leads_from_node_to_node_as_the_robot_went(twice):
     assert there[-1] == pytest.approx(se2.compose(THIRD, newest)[0], abs=1.0)
 
 
-def test_what_is_proposed_is_supposed_and_told_once_and_stays_no_arc(twice):
+def test_a_proposal_is_used_and_reported_once_and_stays_no_arc(twice):
     hybrid_map, scans = twice
     proposals = LoopProposer(CONFIGURATION, AreaViewCache(LocalMapping(CONFIGURATION), scans))
     supposed = proposals.with_proposed_arc(hybrid_map, 3)

@@ -277,7 +277,7 @@ def test_what_is_seen_of_a_state_speaks_for_it_on_average_as_much_as_information
     assert np.mean(ratios) == pytest.approx(1.0, abs=4.0 * np.std(ratios) / math.sqrt(len(ratios)))
 
 
-def test_without_landmarks_nothing_is_told_and_what_is_certain_and_missed_excludes():
+def test_without_landmarks_there_is_no_evidence_and_a_certain_missing_one_excludes():
     assert log_observation_ratios(empty_sequence(), one_state(empty_sequence()), 0.0, 0.0, MODEL)[0] == 0.0
     certain = landmarks((0, 0.0, 0.5, 0, 0, 1.0))
     found = log_observation_ratios(empty_sequence(), one_state(certain), 0.0, 0.0, MODEL._replace(detection=1.0))

@@ -216,7 +216,7 @@ def test_where_the_map_ends_unknown_ground_begins():
     assert there.probabilities[-1] > 0.98
 
 
-def test_the_traveled_distance_tells_openings_apart():
+def test_the_traveled_distance_separates_openings():
     graph = chain([3.0, 4.0])
     start = certain_belief(graph, PLACES, state_of(0, EAST))
     assert start.predict_arrival(Travel(3.1, 0.0, (0.01, 0.01))).most_likely_state == state_of(1, EAST)

@@ -1,4 +1,4 @@
-"""What landmarks say of places where a robot may be that woke up in a map."""
+"""Evidence of landmarks for the place of a robot that starts lost in a map."""
 
 import math
 
@@ -60,7 +60,7 @@ def test_landmarks_speak_for_the_right_place_and_against_others(drive):
     )
     assert right > 1.0
     assert max(others) < right - 5.0
-    # A place a few centimetres off is the same one.
+    # A place a few centimeters off is the same one.
     (near,) = place_prior(scans).log_ratios(
         hybrid_map, seen, before, [located(se2.compose(true, np.array([0.05, 0.05, 0.01])))]
     )
@@ -98,7 +98,7 @@ def test_a_look_finds_the_landmarks_gathered_at_the_events_before(drive, monkeyp
     assert len(looked_at) == before + len(seen)
 
 
-def test_where_keyframes_of_the_map_moved_it_is_looked_at_anew(drive):
+def test_where_keyframes_of_the_map_moved_it_is_evaluated_again(drive):
     hybrid_map, scans, seen, before, true = drive
     prior = place_prior(scans)
     place = [located(true)]

@@ -1,4 +1,4 @@
-"""Real-time localisation: dead reckoning since the last estimate, in the area and in the map."""
+"""Real-time localization: dead reckoning since the last estimate, in the area and in the map."""
 
 import math
 
@@ -40,11 +40,11 @@ def rtl():
     return Rtl(Configuration())
 
 
-def test_nothing_is_said_before_the_first_estimate(rtl):
+def test_nothing_is_sent_before_the_first_estimate(rtl):
     assert rtl.handle(odometry(0.0, 0, 0, 0)) == []
 
 
-def test_each_odometry_reading_is_answered_with_the_estimate_carried_on(rtl):
+def test_each_odometry_reading_is_answered_with_the_estimate_extrapolated(rtl):
     rtl.handle(odometry(0.0, 5, 5, math.pi / 2))
     assert rtl.handle(estimate(0.0, (1, 2, 0), (5, 5, math.pi / 2))) == []
     (said,) = rtl.handle(odometry(0.1, 5, 5.3, math.pi / 2))
@@ -123,7 +123,7 @@ def test_driving_to_and_fro_does_not_make_the_robot_sure_again(rtl):
     assert back.pose_in_area.covariance[0, 0] > there.pose_in_area.covariance[0, 0]
 
 
-def test_an_odometry_reset_is_told_once_and_the_robot_stays_where_it_was(rtl):
+def test_an_odometry_reset_is_reported_once_and_the_robot_stays_where_it_was(rtl):
     rtl.handle(odometry(0.0, 40, 10, 1.0))
     rtl.handle(estimate(0.0, (2, 0, 0), (40, 10, 1.0)))
     rtl.handle(odometry(0.1, 40, 10, 1.0))

@@ -22,7 +22,7 @@ FREE = {
 }
 
 
-def test_mapping_takes_no_memory_but_for_the_arrays_that_kernels_are_said_to_make():
+def test_mapping_takes_no_memory_but_for_the_arrays_that_kernels_are_expected_to_make():
     log = open_log(BAG, duration=10.0)
     run_log(log, Configuration())
     with count_allocations() as counts:

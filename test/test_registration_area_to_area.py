@@ -126,14 +126,14 @@ def test_poses_beyond_the_bounds_are_not_searched(known, visit):
     assert match_areas(visit, known, prior, SETTINGS, np.array([middle + 50.0, middle + 51.0])).modes == ()
 
 
-def test_poses_at_which_the_samples_fit_less_than_asked_for_are_not_searched(known, visit):
+def test_poses_at_which_the_samples_fit_less_than_required_are_not_searched(known, visit):
     prior = prior_around(TRUTH, 1.0, 6.0)
     fits = match_areas(visit, known, prior, replace(SETTINGS, min_log_ratio=0.5)).modes
     assert np.hypot(*se2.between(fits[0].pose.mean, TRUTH)[:2]) < 0.03
     assert match_areas(visit, known, prior, replace(SETTINGS, min_log_ratio=1.2)).modes == ()
 
 
-def test_a_visit_is_found_from_a_prior_of_metres(known, visit):
+def test_a_visit_is_found_from_a_prior_of_meters(known, visit):
     found = match_areas(visit, known, prior_around(TRUTH, 1.0, 6.0), SETTINGS)
     best = found.modes[0].pose
     away = se2.log(se2.between(best.mean, TRUTH))
@@ -142,7 +142,7 @@ def test_a_visit_is_found_from_a_prior_of_metres(known, visit):
     assert away @ np.linalg.solve(best.covariance, away) < 7.8
 
 
-def test_a_precise_prior_and_the_match_agree_to_a_centimetre(known, visit):
+def test_a_precise_prior_and_the_match_agree_to_a_centimeter(known, visit):
     found = match_areas(visit, known, prior_around(TRUTH, 0.05, 1.0, (0.0, 0.0, 0.0)), SETTINGS)
     assert np.abs(se2.log(se2.between(found.modes[0].pose.mean, TRUTH))[:2]).max() < 0.01
 
@@ -225,7 +225,7 @@ def test_a_wall_of_the_candidate_in_the_free_space_of_the_query_speaks_against_i
     )
 
 
-def test_an_empty_query_says_nothing(known):
+def test_an_empty_query_has_no_information(known):
     blank = build_area_grid([], np.zeros((0, 3)), MODEL)
     found = match_areas(blank, known, prior_around(TRUTH, 0.2, 2.0), SETTINGS)
     assert (found.log_evidence, found.modes) == (-math.inf, ())

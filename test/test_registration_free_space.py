@@ -65,13 +65,13 @@ def test_a_pose_that_is_a_little_off_passes_no_wall(mapped, shift):
     assert counted(mapped, ROOM, pose=np.array(shift))[0].in_free_space == 0
 
 
-def test_unknown_ground_tells_nothing():
+def test_unknown_ground_has_no_information():
     area_filter = ParticleFilter(LocalMapping(Configuration()), 0, area=0)
     found, log_ratio = counted(area_filter, ROOM)
     assert (found.on_surface, found.in_free_space, log_ratio) == (0, 0, 0.0)
 
 
-def test_doubt_is_what_ends_in_free_space_and_what_is_passed_less_what_is_usual(mapped):
+def test_the_inconsistency_is_hits_in_free_space_and_passed_surfaces_less_the_usual(mapped):
     scan = scan_in(box(-2.0, -5.0, 3.0, 4.0), HERE, noise=0.01, seed=9, **ALL_ROUND)
     found = mapped.compare_scan(PreparedScan(mapped.mapping, scan))
     first = mapped.clutter_estimate.evaluate(found)

@@ -50,7 +50,7 @@ def squared(belief, truth):
 
 
 @pytest.mark.parametrize(("walls", "truth"), [(two_rooms(), ROOMS), (CORRIDOR, ALONG)])
-def test_steps_and_what_they_add_up_to_are_as_far_off_as_they_say(walls, truth):
+def test_steps_and_what_they_add_up_to_are_as_far_off_as_stated(walls, truth):
     of_steps, of_drift = [], []
     for seed in range(12):
         poses, steps = driven(walls, truth, seed)

@@ -68,7 +68,7 @@ def test_the_likelihood_ratio_equals_the_plain_sum(room, pose):
     assert log_ratio(points, *pose, room, MODEL) == pytest.approx(plain_log_ratio(points, np.array(pose), room))
 
 
-def test_unknown_space_says_nothing_and_known_free_space_contradicts():
+def test_unknown_space_has_no_information_and_known_free_space_contradicts():
     assert MODEL.in_unknown[FAR] == pytest.approx(0.0, abs=1e-3)
     assert MODEL.in_known[FAR] == pytest.approx(np.log(0.1), abs=0.01)
     assert MODEL.in_unknown[0] == pytest.approx(MODEL.in_known[0], abs=0.05)

@@ -87,7 +87,7 @@ def test_one_area_stands_in_its_own_frame(out: Path, tmp_path: Path) -> None:
     assert np.array_equal(one[0], whole[0])
 
 
-def test_what_there_is_no_grid_of_is_told(out: Path, tmp_path: Path, capsys) -> None:
+def test_what_there_is_no_grid_of_is_reported(out: Path, tmp_path: Path, capsys) -> None:
     with pytest.raises(HmtSlamError, match="--area 7 is not in the map: its areas are 0"):
         export_grid(out, tmp_path, area=7)
     with pytest.raises(HmtSlamError, match="--resolution 0 is none for a grid: give"):

@@ -19,7 +19,7 @@ print(before["libraries"], before["kernels"], after["libraries"], after["kernels
 """
 
 
-def test_libraries_and_compiled_kernels_are_told_from_data():
+def test_libraries_and_compiled_kernels_are_distinguished_from_data():
     told = subprocess.run([sys.executable, "-c", COMPILED], capture_output=True, text=True, check=True).stdout
     libraries, kernels, more_libraries, more_kernels = map(int, told.split())
     assert libraries > 1_000_000

@@ -75,7 +75,7 @@ def verdict_poses(*areas: int) -> tuple[AreaPose, ...]:
 
 
 def trails() -> list[ScanPoses]:
-    """Hypothesis 0 up to the cut, 1 and 2 after it; 2 is wrong by a metre and must not be used."""
+    """Hypothesis 0 up to the cut, 1 and 2 after it; 2 is wrong by a meter and must not be used."""
     rows = []
     for first in range(0, SCANS, EVERY):
         index = np.arange(first, min(first + EVERY, SCANS))
@@ -174,7 +174,7 @@ def test_every_file_of_the_design_is_there(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["trajectory.tum", "trajectory_online.tum"])
-def test_both_trajectories_are_true_and_carry_the_logs_own_stamps(folder: Path, name: str) -> None:
+def test_both_trajectories_are_true_and_have_the_logs_own_stamps(folder: Path, name: str) -> None:
     trajectory = read_tum(folder / name)
     np.testing.assert_array_equal(trajectory.stamps, SOURCE)
     np.testing.assert_allclose(trajectory.poses, TRUTH, atol=1e-8)
@@ -193,7 +193,7 @@ def test_a_message_that_comes_twice_counts_once(folder: Path, tmp_path: Path) ->
     assert contents(tmp_path) == contents(folder)
 
 
-def test_the_recorder_is_complete_only_when_everything_has_been_heard() -> None:
+def test_the_recorder_is_complete_only_when_everything_has_arrived() -> None:
     assert recorded().is_complete
     for kind in (EndOfRun, ClosureDecision, Hypotheses, LocalEstimate):
         assert not recorded(without=kind).is_complete
@@ -223,7 +223,7 @@ def test_a_scan_that_is_not_in_the_log_is_named() -> None:
         recorded().finish(STAMPS[:-1])
 
 
-def test_a_scan_without_a_pose_gets_one_between_its_neighbours() -> None:
+def test_a_scan_without_a_pose_gets_one_between_its_neighbors() -> None:
     recorder = recorded()
     trail = recorder.scan_poses.pop((1, 16))
     keep = np.array([True, False, True, True])

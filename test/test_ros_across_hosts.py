@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, 
 PROCESSES = process_names()
 SCANS = 60
 DECIDED = ("scans.bin", "chain.bin", "tlca.bin")
-"""Files of a map with what all processes said and decided."""
+"""Files of a map with what all processes sent and decided."""
 
 
 @pytest.fixture

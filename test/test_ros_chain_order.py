@@ -1,4 +1,4 @@
-"""Whatever the order in which DDS delivers the topics, a process hears the chain in one order."""
+"""Whatever the order in which DDS delivers the topics, a process receives the chain in one order."""
 
 import pytest
 from hypothesis import given
@@ -55,7 +55,7 @@ def test_a_repeated_message_is_put_aside_and_counted():
     assert order.fault is None
 
 
-def test_a_gap_is_told_and_nothing_behind_it_is_delivered():
+def test_a_gap_is_reported_and_nothing_behind_it_is_delivered():
     order = ChainOrder((Keyframe,))
     order.push(message(Keyframe, 0))
     assert order.push(message(Keyframe, 3)) == []

@@ -22,7 +22,7 @@ from hmt_slam_ros.ros.tsbi_node import pmf_message
 from hmt_slam_ros.sensors import Odometry, Scan
 
 STAMPS = st.integers(0, 2**31 * 10**9 - 1)
-# The smallest doubles have too few bits for half of them to be told.
+# Half of the smallest doubles cannot be represented.
 ANGLES = st.floats(-math.pi, math.pi, exclude_max=True).map(lambda angle: angle if abs(angle) > 1e-300 else 0.0)
 METRES = st.floats(-1e6, 1e6)
 

@@ -52,12 +52,12 @@ def test_a_correction_falls_to_a_third_in_its_time_without_a_jump():
 
 
 def test_what_is_no_correction_but_another_place_is_shown_at_once():
-    # A turn of 1.1 degrees about odometry's origin, 360 m away, carries the robot by 7 m.
+    # A turn of 1.1 degrees about odometry's origin, 360 m away, moves the robot by 7 m.
     shown, known = driven(time=0.5)
     np.testing.assert_allclose(shown, known, atol=1e-6)
 
 
-def test_time_that_jumps_back_begins_anew():
+def test_time_that_jumps_back_restarts():
     correction = CorrectionSmoother()
     correction.smooth(100 * STEP, KNOWN, FAR, 0.5)
     near = np.array([1e-3, 2e-3, 1e-5])

@@ -68,7 +68,7 @@ def test_a_sound_robot_gets_a_clean_bill(listener, doctor, start):
     assert any("were compared with odometry" in text for text in fine)
 
 
-def test_what_is_silent_missing_or_does_not_fit_is_told(listener, doctor):
+def test_what_is_silent_missing_or_does_not_fit_is_reported(listener, doctor):
     listener.node.create_publisher(LaserScan, "scan", BEST_EFFORT)
     listener.node.create_subscription(LaserScan, "scan", lambda _: None, 10)
     simulated = Node("slam", context=listener.context, parameter_overrides=[Parameter("use_sim_time", value=True)])
@@ -112,7 +112,7 @@ def test_nodes_that_are_not_active_are_named_with_what_makes_them_so(listener, s
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
-def test_stamps_frames_and_doubled_transforms_are_told_under_a_namespace(listener, doctor):
+def test_stamps_frames_and_doubled_transforms_are_reported_under_a_namespace(listener, doctor):
     records = iter(list(open_log(WORLD, duration=90.0).records()))
     scans = listener.node.create_publisher(LaserScan, "robot1/scan", 10)
     readings = listener.node.create_publisher(OdometryMessage, "robot1/base/odom", 10)

@@ -71,7 +71,7 @@ def test_it_explores_and_goes_where_it_is_sent(listener, system):
     assert outcomes[2].data == "go area 0: the robot is there"
 
 
-def test_with_another_map_it_begins_anew_also_where_it_was_not_there_when_the_map_was_exchanged(
+def test_with_another_map_it_restarts_also_where_it_was_not_there_when_the_map_was_exchanged(
     listener, system, start
 ):
     outcomes = listener.hear(String, "explorer/task_result", topics.LATCHED)
@@ -90,7 +90,7 @@ def test_with_another_map_it_begins_anew_also_where_it_was_not_there_when_the_ma
 
 
 def test_where_a_part_of_the_map_never_comes_it_ends_with_a_sentence(listener, system, start):
-    """Slam comes back without what it said before its last checkpoint, and the explorer has not heard that."""
+    """Slam comes back without what it sent before its last checkpoint, and the explorer did not receive that."""
     keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
     nodes = system()
     listener.until(lambda: len(keyframes) > 2, alive=nodes)

@@ -125,7 +125,7 @@ def test_rtl_that_is_killed_goes_on_with_the_pose_and_the_parameters_that_it_had
     assert not list(tmp_path.iterdir())
 
 
-def test_a_process_that_was_dead_while_the_others_began_anew_begins_anew_too(corridor, listener, start, tmp_path):
+def test_a_process_that_was_dead_while_the_others_restarted_restarts_too(corridor, listener, start, tmp_path):
     log, out = corridor
     parameters = {"start_from": out, "start_lost": False, "recovery": tmp_path}
     nodes = Nodes(start, listener, **parameters)
@@ -141,7 +141,7 @@ def test_a_process_that_was_dead_while_the_others_began_anew_begins_anew_too(cor
     assert asked.result().success, asked.result().message
     nodes.drive(log, first=0, robot__duration=6.0)
     nodes.until(lambda: len(nodes.estimates) == 15 + 30)
-    # Of the new map, though slam said keyframes of the same numbers before the reset.
+    # Of the new map, though slam sent keyframes of the same numbers before the reset.
     kill(nodes.alive[1])
     restart(nodes, "aam", 1, **parameters)
     nodes.park()
@@ -154,7 +154,7 @@ def test_a_process_that_was_dead_while_the_others_began_anew_begins_anew_too(cor
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
-def test_all_are_killed_with_what_said_where_the_laser_is_and_go_on_without_it(domain, listener, start, tmp_path):
+def test_all_are_killed_with_the_transform_of_the_laser_and_continue_without_it(domain, listener, start, tmp_path):
     nodes = Nodes(start, listener, recovery=tmp_path / "recovery")
     nodes.drive(corridor_bag(tmp_path, scans=60), first=0, robot__duration=5.9)
     nodes.until(lambda: len(nodes.estimates) == 30)
@@ -167,7 +167,7 @@ def test_all_are_killed_with_what_said_where_the_laser_is_and_go_on_without_it(d
     for one in corridor_measurements(60)[150:]:
         driver.send(one)
     nodes.until(lambda: driver.answered()[-1] == START + 59 * 200_000_000)
-    # What was under way when they were killed is said again.
+    # What was under way when they were killed is reported again.
     assert sorted(set(driver.answered())) == [START + k * 200_000_000 for k in range(60)]
     end = 4 * 59 * PACE
     nodes.until(
@@ -278,7 +278,7 @@ def test_a_laser_falls_silent_a_disk_is_full_and_time_jumps_back(listener, start
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
-def test_a_missing_transform_and_clocks_that_are_apart_are_told_with_the_remedy(listener, start):
+def test_a_missing_transform_and_clocks_that_are_apart_are_reported_with_the_remedy(listener, start):
     told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
     scans = listener.node.create_publisher(LaserScan, SCAN, topics.SENSOR)
@@ -319,7 +319,7 @@ def joints(messages):
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
-def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_that_is_told_to_be(
+def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_that_is_configured_so(
     listener, start, tmp_path
 ):
     names = {"map": "map", "odom": "odom", "base": "base_link", "laser": "laser"}

@@ -1,4 +1,4 @@
-"""Every node starts, says how it is, and ends with status 0 when told to."""
+"""Every node starts, says how it is, and ends with status 0 on request."""
 
 import signal
 import subprocess
@@ -33,7 +33,7 @@ def parameters(name, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
-def test_every_node_that_runs_ends_well_when_told_to(tmp_path, listener, start, number):
+def test_every_node_that_runs_ends_well_on_request(tmp_path, listener, start, number):
     told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     processes = {name: start(name, **parameters(name, tmp_path)) for name in NODES}
     listener.until(lambda: all(level(told, name) for name in NODES), alive=processes.values())
@@ -57,7 +57,7 @@ def test_a_value_out_of_range_keeps_every_node_from_starting(tmp_path, start):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
-def test_a_node_that_is_still_being_loaded_ends_well_when_told_to(start, number):
+def test_a_node_that_is_still_being_loaded_ends_well_on_request(start, number):
     processes = []
     for moment in range(6):
         processes.append(start("slam"))
@@ -91,7 +91,7 @@ def level(told, name):
     return levels[-1] if levels else None
 
 
-def test_a_malformed_document_is_told_and_survived(listener, start):
+def test_a_malformed_document_is_reported_and_survived(listener, start):
     told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     events = listener.node.create_publisher(String, DOCUMENTS[ClosureDecision], topics.CHAIN)
     process = start("rtl")
@@ -100,7 +100,7 @@ def test_a_malformed_document_is_told_and_survived(listener, start):
     assert "has version 99, not 1" in level(told, "rtl").message
 
 
-def test_a_lost_message_of_the_chain_is_told(listener, start):
+def test_a_lost_message_of_the_chain_is_reported(listener, start):
     told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     accepted = listener.node.create_publisher(String, DOCUMENTS[ClosureDecision], topics.CHAIN)
     process = start("rtl")
@@ -111,7 +111,7 @@ def test_a_lost_message_of_the_chain_is_told(listener, start):
 
 
 def test_a_node_that_starts_late_catches_up(listener, start):
-    """What was said before a node started is latched, and reaches it in the order of the chain."""
+    """What was reported before a node started is latched, and reaches it in the order of the chain."""
     keyframes = listener.node.create_publisher(String, KEYFRAMES, topics.CHAIN)
     hypotheses = listener.node.create_publisher(String, DOCUMENTS[Hypotheses], topics.CHAIN)
     accepted = listener.node.create_publisher(String, DOCUMENTS[ClosureDecision], topics.CHAIN)
@@ -178,7 +178,7 @@ def test_rtl_publishes_the_transform_from_map_to_odom(listener, start):
     assert (joint.transform.translation.x, joint.transform.translation.y) == pytest.approx((-4.0, 2.0))
 
 
-def test_a_driver_that_may_lose_messages_is_heard_too(listener, start):
+def test_a_best_effort_driver_is_received_too(listener, start):
     live = listener.node.create_publisher(OdometryMessage, "odom", topics.LIVE_SENSOR)
     told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     process = start("rtl")
@@ -195,7 +195,7 @@ def test_a_driver_that_may_lose_messages_is_heard_too(listener, start):
         assert process.poll() is None
 
 
-def test_aam_answers_nothing_it_was_not_asked(listener, start):
+def test_aam_answers_only_to_keyframes(listener, start):
     answers = listener.hear(String, DOCUMENTS[AreaEvents], topics.CHAIN)
     costs = listener.hear(Float64MultiArray, "hmt/cost", topics.CHAIN)
     told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)

@@ -75,7 +75,7 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, star
     (goal,) = goals
     assert goal.header.frame_id == "map"
     place = se2.compose(origin, pose_from_message(goal.pose))
-    # The last keyframe in the room is up to half a metre before the drive's end.
+    # The last keyframe in the room is up to half a meter before the drive's end.
     np.testing.assert_allclose(place, (ROOM[0], ROOM[1] - 0.25, 0.5 * math.pi), atol=0.25)
     assert math.dist(pose_from_message(truths[-1].pose)[:2], place[:2]) < 0.2
     said = [value.value for m in diagnostics if m.status[0].name == "/pilot" for value in m.status[0].values]
@@ -89,7 +89,7 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, star
     assert np.abs(off).max() < 0.05, off
     listener.until(lambda: localized[-1].data, alive=others)
 
-    # Killed, it begins anew: the robot may be anywhere, and stands.
+    # Killed, it restarts: the robot may be anywhere, and stands.
     os.kill(pilot.pid, signal.SIGKILL)
     pilot.wait(10)
     again = start("pilot", **shared)

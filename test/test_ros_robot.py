@@ -37,7 +37,7 @@ SCANS = [record.measurement for record in Corridor().records() if isinstance(rec
 def heard(listener):
     """What comes on /clock, /tf, /scan, /odom and the status.
 
-    The robot waits for those who hear /scan and /odom; DDS announces subscriptions in the order in which they were
+    The robot waits for subscribers of /scan and /odom; DDS announces subscriptions in the order in which they were
     made, so the others are there by then too.
     """
     return {
@@ -136,7 +136,7 @@ def test_a_paced_robot_waits_for_the_acknowledgement(tmp_path, listener, start, 
     listener.until(lambda: last_status(heard)["state"] == "ended" and last_status(heard)["acknowledged"] == 12)
 
 
-def test_the_robot_waits_for_those_who_have_to_hear_it_and_answer(tmp_path, listener, start):
+def test_the_robot_waits_for_those_who_subscribe_to_it_and_answer(tmp_path, listener, start):
     listener.hear(LaserScan, "scan", topics.SENSOR)  # as a recorder does
     robot = start(
         "robot",
@@ -270,7 +270,7 @@ def test_commands_drive_the_robot_and_silence_stops_it(listener, start, heard, d
 
 
 def test_the_driven_robot_does_not_pass_a_wall(listener, start, driver):
-    # It begins a metre before the end of a hallway, with its back to it.
+    # It begins a meter before the end of a hallway, with its back to it.
     reports = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     contacts = lambda: [v.value for r in reports[-1:] for v in r.status[0].values if v.key == "contacts"]  # noqa: E731
     robot = start_driven(start)
@@ -284,7 +284,7 @@ def test_the_driven_robot_does_not_pass_a_wall(listener, start, driver):
     listener.until(lambda: contacts() == ["1"], alive=[robot])
 
 
-def test_a_command_that_is_no_number_stops_the_robot_and_is_told(listener, start, driver):
+def test_a_command_that_is_no_number_stops_the_robot_and_is_reported(listener, start, driver):
     robot = start_driven(start)
     listener.until(driver.stands, alive=[robot])
     begin, count = driver.poses[-1], len(driver.truths)

@@ -1,4 +1,4 @@
-"""Services by which the map is asked for, exchanged and forgotten, and mapping pauses, while the nodes run."""
+"""Services by which the map is requested, exchanged and forgotten, and mapping pauses, while the nodes run."""
 
 import re
 import shutil
@@ -29,7 +29,7 @@ TRANSFORMS = {"tf", "tf_static"} if TFMessage else set()
 NAMED = {value for name, value in vars(topics).items() if name.isupper() and isinstance(value, str)}
 MESSAGES = Path(__file__).parent.parent / "docs" / "reference" / "messages.md"
 SAID = {f"/{topic.lstrip('/')}" for topic in {*NAMED, *topics.DOCUMENTS.values(), *TRANSFORMS}} - {
-    *("/initialpose", "/cmd_vel"),  # which are only heard
+    *("/initialpose", "/cmd_vel"),  # which are subscribed to
     "/ground_truth",  # of a robot that is driven
     *("/goal_pose", "/pilot/place_estimate"),  # of explorer and pilot
     "/hmt/notices",  # as there is nothing to complain of
@@ -83,7 +83,7 @@ def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corr
     nodes.until(lambda: nodes.poses and np.abs(pose_from_message(nodes.poses[-1].pose.pose) - end).max() < 0.15)
 
 
-def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_that_is_said_can_be_recorded(
+def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_messages_can_be_recorded(
     corridor, listener, start, tmp_path
 ):
     log, out = corridor

@@ -28,13 +28,13 @@ SHUTDOWN = {
     "active": Transition.TRANSITION_ACTIVE_SHUTDOWN,
 }
 LOST, ASKED = 20.0, 3
-"""After so long no answer comes any more, s; and how often a node is asked for its state."""
+"""After so long no answer comes any more, s; and how often the state of a node is requested."""
 
 UP, DOWN = ("rtl", "tsbi", "slam", "aam", "tlca"), ("tlca", "slam", "rtl", "aam", "tsbi")
 
 
 class Manager:
-    """Asks nodes for transitions, as a lifecycle manager does."""
+    """Requests transitions of nodes, as a lifecycle manager does."""
 
     def __init__(self, listener):
         self.listener = listener
@@ -138,13 +138,13 @@ def halt(manager, nodes, name):
 
 
 def take_down_and_up(manager, name):
-    """Let an inactive node begin anew; it hears the whole chain once more."""
+    """Let an inactive node restart; it receives the whole chain once more."""
     for transition, state in (("cleanup", "unconfigured"), ("configure", "inactive"), ("activate", "active")):
         manager.lead([name], transition, state)
 
 
 def renew_rtl(manager, nodes):
-    """Let rtl begin anew, until all know of it that it hears odometry and says where the robot is."""
+    """Let rtl restart, until all know of it that it receives odometry and says where the robot is."""
     node = nodes.listener.node
     manager.lead(["rtl"], "deactivate", "inactive")
     manager.lead(["rtl"], "cleanup", "unconfigured")
@@ -155,7 +155,7 @@ def renew_rtl(manager, nodes):
 
 
 def stands(nodes):
-    """Nothing more is said of scans before the end of the log, but for what is on its way."""
+    """Nothing more is reported of scans before the end of the log, but for what is on its way."""
     before = -1
     while before < len(nodes.estimates):
         before = len(nodes.estimates)
@@ -164,7 +164,7 @@ def stands(nodes):
 
 
 def begun_anew(manager, nodes, log):
-    """Slam alone does not begin anew, all five do."""
+    """Slam alone does not restart, all five do."""
     manager.lead(["slam"], "cleanup", "unconfigured")
     assert not manager.change("slam", "configure")
     assert manager.state("slam") == "unconfigured"

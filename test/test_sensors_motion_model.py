@@ -38,7 +38,7 @@ def test_odometry_is_unknown_before_the_first_reading_and_after_the_last():
     assert not buffer.covers(11)
 
 
-def test_odometry_whose_stamps_jump_back_starts_anew():
+def test_odometry_whose_stamps_jump_back_restarts():
     buffer = OdometryBuffer()
     buffer.add(Odometry(1000, np.array([5.0, 0.0, 0.0])))
     buffer.add(Odometry(10, np.zeros(3)))
@@ -95,7 +95,7 @@ def test_where_scans_do_not_show_the_motion_the_velocity_becomes_uncertain():
     assert across[-1] < 1.2 * across[0]
 
 
-def test_a_jump_says_nothing_of_the_velocity_and_a_velocity_that_lasts_is_learnt_at_once():
+def test_a_jump_has_no_information_on_the_velocity_and_a_velocity_that_lasts_is_learnt_at_once():
     inertia = Inertia(MotionParameters())
     driven(inertia, np.array([0.3, 0.0, 0.0]), 0.2 * np.arange(20))
     inertia.predict(0.2)
@@ -157,7 +157,7 @@ def test_a_slip_is_not_taken_for_noise():
     assert learnt(1.0, slips=(200,)).factors[1] < 1.3
 
 
-def test_what_scans_do_not_show_says_nothing_of_the_noise():
+def test_what_scans_do_not_show_has_no_information_on_the_noise():
     noise = OdometryNoise()
     covariance = np.diag([0.01, 0.01, 0.001])
     for _ in range(100):
@@ -180,7 +180,7 @@ def test_odometry_predicts_where_readings_enclose_both_scans_and_inertia_elsewhe
     assert said[7].covariance[0, 0] == pytest.approx(said[1].covariance[0, 0])
 
 
-def test_where_odometry_is_silent_its_pose_is_carried_on_by_the_match():
+def test_where_odometry_is_silent_its_pose_is_extrapolated_by_the_match():
     model = MotionModel(MotionParameters())
     model.odometry.add(Odometry(0, np.array([3.0, 0.0, 0.0])))
     for k in range(4):
@@ -207,7 +207,7 @@ def test_noisy_odometry_and_inertia_together_tell_the_motion_better_where_no_sca
     assert (np.sqrt((late**2).mean(axis=0)) < 0.6 * noise).all()
 
 
-def test_odometry_that_the_scans_contradict_says_nothing_of_the_velocity():
+def test_odometry_that_the_scans_contradict_has_no_information_on_the_velocity():
     models = [MotionModel(MotionParameters()), MotionModel(MotionParameters())]
     for k in range(20):
         for model in models:

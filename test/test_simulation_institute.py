@@ -22,7 +22,7 @@ def ahead(scenario, poses, reach=30.0):
 
 
 def open_doors(scenario):
-    """The middles of the doors in the frame of the hallways, to the centimetre."""
+    """The middles of the doors in the frame of the hallways, to the centimeter."""
     crossings = scenario.building.states.poses[scenario.building.states.crossings]
     frame = np.array([*crossings[:2, :2].mean(axis=0), crossings[0, 2]])
     doors = scenario.building.doors
@@ -42,7 +42,7 @@ def test_there_are_four_crossings_and_nine_open_rooms_apart_from_each_other(seed
 
 @pytest.mark.parametrize("visit", [0, 1])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_openings_are_as_wide_as_is_said_and_lead_somewhere(seed, visit):
+def test_openings_are_as_wide_as_stated_and_lead_somewhere(seed, visit):
     scenario = scenario_of(seed, visit=visit)
     states = scenario.building.states
     openings = states.openings
@@ -83,7 +83,7 @@ def test_both_hallways_are_driven_from_end_to_end(seed):
         assert driven.min() < -ends[1] + 1.1
 
 
-def test_the_floor_is_fifty_by_twenty_five_metres():
+def test_the_floor_is_fifty_by_twenty_five_meters():
     for seed in SEEDS:
         scenario = scenario_of(seed)
         crossings = scenario.building.states.poses[:2]

@@ -28,8 +28,8 @@ def mapped(tmp_path_factory):
     return folder, said
 
 
-def test_a_small_loop_is_closed_and_mapped_to_two_centimetres(mapped):
-    """Two laps of 45 m: the mean error of relations to the next metres, and to where the robot was a lap before."""
+def test_a_small_loop_is_closed_and_mapped_to_two_centimeters(mapped):
+    """Two laps of 45 m: the mean error of relations to the next meters, and to where the robot was a lap before."""
     folder, said = mapped
     assert "0 dropped" in said
     assert "loop closures: 0" not in said
@@ -49,7 +49,7 @@ def test_its_bag_makes_the_same_map_as_far_as_quaternions_are_exact(mapped, tmp_
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
 
 
-def test_a_motion_model_that_is_told_the_truth_finds_nothing_wrong_with_the_odometry():
+def test_a_motion_model_that_has_the_true_parameters_finds_nothing_wrong_with_the_odometry():
     model, last, factors = MotionModel(MotionParameters()), None, []
     certain = 1e8 * np.eye(3)
     for record in open_log("sim:nested,seed=1", duration=600.0).records():

@@ -124,7 +124,7 @@ def test_a_leader_that_is_less_likely_though_not_clearly_is_kept_by_resampling()
     assert shares == [1, count - 1]
 
 
-def test_a_particle_that_is_clearly_more_likely_takes_the_lead_and_it_is_told():
+def test_a_particle_that_is_clearly_more_likely_takes_the_lead_and_it_is_reported():
     area_filter, _ = driven(LocalMapping(Configuration()), steps=8)
     count = len(area_filter.poses)
     heaviest = (area_filter.leader + 1) % count
@@ -205,7 +205,7 @@ def test_beams_beyond_the_range_tell_free_space_up_to_it():
     assert len(points) + len(free) == 181
 
 
-def test_when_keyframes_move_the_map_is_built_anew_and_the_robot_stays_where_it_is_from_its_anchor():
+def test_when_keyframes_move_the_map_is_rebuilt_and_the_robot_stays_where_it_is_from_its_anchor():
     area_filter, _ = driven(LocalMapping(Configuration()), steps=30)
     scans = {0: scan_in(ROOM, np.zeros(3))}
     truth = np.zeros(3)

@@ -50,7 +50,7 @@ def error_of(pose, truth):
 
 
 @pytest.mark.parametrize("slip", [-35.0, -10.0, 10.0, 35.0])
-def test_a_heading_slip_is_found_and_told(mapping, slip):
+def test_a_heading_slip_is_found_and_reported(mapping, slip):
     area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
     truth = np.array([0.3, 0.1, 0.2])
     slipped = se2.compose(truth, (0.0, 0.0, np.radians(slip)))
@@ -61,7 +61,7 @@ def test_a_heading_slip_is_found_and_told(mapping, slip):
     assert tracked.contradicts_odometry
 
 
-def test_odometry_that_the_scan_confirms_is_not_doubted(mapping):
+def test_odometry_that_the_scan_confirms_is_not_rejected(mapping):
     area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
     truth = np.array([0.3, 0.1, 0.2])
     tracked = track(area_filter, ROOM, truth, RelativeMotion(truth + np.array([0.02, -0.02, 0.01]), SURE))
@@ -148,7 +148,7 @@ def test_along_a_corridor_the_best_of_many_fits_is_taken(mapping, seed, ahead):
     assert angle < 1.0
 
 
-def test_what_the_scans_leave_open_is_carried_on_until_the_next_keyframe(mapping):
+def test_what_the_scans_leave_open_is_extrapolated_until_the_next_keyframe(mapping):
     area_filter = mapped(mapping, CORRIDOR, [(x, 0, 0) for x in range(-6, 7)])
     along = []
     for k in range(1, 9):

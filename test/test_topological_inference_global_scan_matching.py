@@ -1,4 +1,4 @@
-"""Keyframes of which the arcs tell nothing are laid into the whole map, at any pose."""
+"""Keyframes of which the arcs have no information are laid into the whole map, at any pose."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def whole_map(scans):
 
 @pytest.fixture
 def laid(asked):
-    """Lays the keyframes of ``asked`` into areas of the map."""
+    """Lays the keyframes of ``requested`` into areas of the map."""
     hybrid_map, poses, scans = asked
     whole = whole_map(scans)
     return lambda areas: whole.match_regions(hybrid_map, poses, 1000, dict.fromkeys(areas, 1.0 / len(areas)))
@@ -53,7 +53,7 @@ def off(fit):
     return np.hypot(away[0], away[1])
 
 
-def test_a_room_is_recognised_from_anywhere_in_it(laid):
+def test_a_room_is_recognized_from_anywhere_in_it(laid):
     best = max(laid([0, 1]), key=lambda fit: fit.mode.log_mass)
     assert best.area == 0
     assert off(best) < 0.05
@@ -69,7 +69,7 @@ def test_what_came_after_is_no_part_of_the_map(asked):
     assert {fit.area for fit in whole.match_regions(hybrid_map, poses, 12, {0: 0.5, 2: 0.5})} == {0}
 
 
-def test_a_room_in_which_the_map_has_traces_of_people_is_recognised(asked, laid):
+def test_a_room_in_which_the_map_has_traces_of_people_is_recognized(asked, laid):
     """They stand where the robot sees free space, which is no sign of another place."""
     hybrid_map, _, scans = asked
     crowd = np.concatenate([box(x, y, x + 0.3, y + 0.3) for x in (0.8, 2.2, 4.3) for y in (0.9, 2.0, 3.4)])
@@ -105,7 +105,7 @@ def test_all_areas_are_looked_at_however_many_there_are(asked, laid):
 
 
 def test_walls_tell_where_keyframes_lie(asked, laid):
-    """As they were found, no wall is seen through; half a metre aside, the robot would see through some."""
+    """As they were found, no wall is seen through; half a meter aside, the robot would see through some."""
     hybrid_map, poses, scans = asked
     best = max(laid([0]), key=lambda fit: fit.mode.log_mass)
     found = whole_map(scans).check_walls(hybrid_map, best, poses, 1000)
@@ -117,12 +117,12 @@ def test_walls_tell_where_keyframes_lie(asked, laid):
     assert whole_map(scans).check_walls(hybrid_map, best, poses, 0).samples == 0
 
 
-def test_none_but_the_areas_asked_for_are_looked_at(laid):
+def test_none_but_the_areas_requested_are_looked_at(laid):
     assert {fit.area for fit in laid([1])} <= {1}
     assert {fit.area for fit in laid([0])} == {0}
 
 
-def test_a_fit_is_told_in_the_frame_of_its_area_wherever_that_lies_in_its_region(asked, laid):
+def test_a_fit_is_reported_in_the_frame_of_its_area_wherever_that_lies_in_its_region(asked, laid):
     hybrid_map, _, scans = asked
     for k, pose in enumerate(PATH):
         scans[30 + k] = seen(ROOM, pose, 30 + k)

@@ -1,4 +1,4 @@
-"""Weights of the leaves and what is remembered of them."""
+"""Weights of the hypotheses and what is remembered of them."""
 
 import math
 from dataclasses import replace
@@ -24,7 +24,7 @@ def settled(weights, skipped=0.0, unexamined=0.0, most=16, least=1e-6):
     return normalize_and_reduce(logs, log_skipped, unexamined, most, least, random_stream(0, Purpose.HYPOTHESES, 0))
 
 
-def test_weights_are_normalised():
+def test_weights_are_normalized():
     assert settled([2.0, 6.0]).probabilities.tolist() == pytest.approx([0.25, 0.75])
 
 

@@ -34,9 +34,9 @@ HALL = np.concatenate((box(-3.0, 0.5, 9.0, 4.5), box(4.0, 3.0, 5.0, 4.0)))
 
 
 def asked(rooms, doubts, first=FAR, hall=2):
-    """What comes of doubts in the last room, {keyframe of it: nats}; arcs have the others far off but the first.
+    """The branches by inconsistencies in the last room, {keyframe of it: nats}; all arcs but the first lead far off.
 
-    The robot was carried there from a hall, in which it stored ``hall`` keyframes.
+    The robot was kidnapped there from a hall, in which it stored ``hall`` keyframes.
     """
     parent, branching, newest = rooms_apart(rooms, [first, *[FAR] * (len(rooms) - 2)], 0.1)
     for k, keyframe in enumerate(newest[:hall]):
@@ -104,7 +104,7 @@ def test_where_nothing_is_stored_it_goes_over_into_the_area_where_it_was_recogni
     assert run.tsbi.state.hypothesis_states[0].localization.relocalized_area is None
 
 
-def test_on_ground_that_nobody_knows_the_doubts_alone_speak_for_it():
+def test_on_ground_that_nobody_knows_the_inconsistencies_alone_speak_for_it():
     _, lost = asked((OTHER, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight == pytest.approx(PRIOR + 8.0 + math.log(KIDNAPPED_UNMAPPED_PRIOR), abs=0.5)
     assert lost.state.localization.candidate is None
@@ -120,7 +120,7 @@ def test_that_the_place_is_known_where_the_robot_would_be_anyway_speaks_against_
     [{}, {2: 1.0}, {4: 12.0}],
     ids=["sure", "hardly doubtful", "just now, and two keyframes are too few"],
 )
-def test_a_robot_that_is_hardly_displaced_is_not_asked_about(doubts):
+def test_a_robot_that_is_hardly_displaced_is_not_examined(doubts):
     assert asked((ROOM, OTHER, ROOM), doubts) is None
 
 
@@ -251,7 +251,7 @@ def test_what_contradicts_at_every_keyframe_is_clutter():
     assert notes.kidnapping_test == (-math.inf, 0)
 
 
-def test_a_doubt_passes_with_scans_that_fit():
+def test_an_inconsistency_passes_with_scans_that_fit():
     notes = HypothesisState().after_scan(5, 4.0)
     for event in range(6, 9):
         notes = notes.after_scan(event, -0.3)

@@ -17,7 +17,7 @@ ROOM = np.concatenate((box(-6.0, -3.0, 6.0, 4.0), box(1.0, 1.0, 2.5, 2.0), box(-
 
 
 def corridor(seed):
-    """A corridor of 40 m with a niche every few metres, each 0.2 m deep and 1 m wide, on both sides."""
+    """A corridor of 40 m with a niche every few meters, each 0.2 m deep and 1 m wide, on both sides."""
     walls = []
     for side in (-1.0, 1.0):
         at, steps = -20.0, np.random.default_rng([seed, int(side) + 1]).uniform(2.0, 5.0, 30)

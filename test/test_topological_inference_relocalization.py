@@ -1,4 +1,4 @@
-"""A robot that wakes up somewhere in a map, or is carried, maps around itself, until it is recognized where it is."""
+"""A robot that starts somewhere in a map, or is kidnapped, maps around itself, until it is recognized where it is."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def begin(office):
 
 
 def carried(office, records, scans):
-    """A run that woke up in a map and read so many scans."""
+    """A run that started in a map and read so many scans."""
     run = LockStepRun(Configuration(), state=office.state)
     run.lock_step.feed(PoseReset())
     for record in records:
@@ -54,7 +54,7 @@ def carried(office, records, scans):
     return run
 
 
-def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office, begin):
+def test_it_begins_a_new_area_to_which_an_arc_leads_that_has_no_information(office, begin):
     before = Replica.from_state(office.state.processes["tsbi"].replica)
     run = carried(office, office.records[begin:], 10)
     replica = Replica.from_state(run.state.processes["tsbi"].replica)
@@ -87,7 +87,7 @@ def test_without_landmarks_as_prior_it_is_recognized_too(maps, share):
     assert found.found <= FAR
 
 
-def test_in_the_map_of_the_first_half_it_wakes_up_in_the_second_near_keyframes_of_the_first(maps):
+def test_in_the_map_of_the_first_half_it_starts_in_the_second_near_keyframes_of_the_first(maps):
     log, whole = maps["first half"], maps["whole"]
     scans = Replica.from_state(log.state.processes["tsbi"].replica).scans.values()
     stamps = {log.records[scan].measurement.stamp: n for n, scan in enumerate(log.scans)}
@@ -125,7 +125,7 @@ def test_in_a_building_that_it_does_not_know_it_stays_lost(office, seed):
 
 
 def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(office, begin):
-    """In the place of a keyframe; what is said is 0.4 m and 6 degrees off."""
+    """In the place of a keyframe; the initial pose is 0.4 m and 6 degrees off."""
     replica = Replica.from_state(office.state.processes["tsbi"].replica)
     hybrid_map = replica.maps[replica.best_hypothesis]
     scan = office.records[begin].measurement
@@ -147,13 +147,13 @@ def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(
     assert sum(leaf.probability for leaf in leaves if not leaf.lost) > 0.9
 
 
-def test_scans_are_counted_on_and_odometry_begins_anew(office, begin):
+def test_scans_are_counted_on_and_odometry_restarts(office, begin):
     run = carried(office, office.records[begin:], 25)
     assert run.state.processes["slam"].processed_scans == office.state.processes["slam"].processed_scans + 25
     assert run.state.processes["slam"].dropped_scans == 0
 
 
-def test_one_that_is_carried_while_it_maps_notices_and_is_recognized():
+def test_one_that_is_kidnapped_while_it_maps_notices_and_is_recognized():
     found = drive_kidnapped(CARRIED)
     assert found.noticed <= SOON
     assert found.again <= FAR
@@ -161,7 +161,7 @@ def test_one_that_is_carried_while_it_maps_notices_and_is_recognized():
     assert max(found.errors) < 0.1
 
 
-def test_one_that_is_carried_while_it_stores_nothing_notices_and_is_recognized(office):
+def test_one_that_is_kidnapped_while_it_stores_nothing_notices_and_is_recognized(office):
     run = LockStepRun(Configuration(mode="localization"), state=office.state)
     run.lock_step.feed(PoseReset())
     log = open_log(CARRIED)
@@ -182,6 +182,6 @@ def test_one_that_is_carried_while_it_stores_nothing_notices_and_is_recognized(o
     assert run.state.processes["slam"].dropped_scans == 0
 
 
-def test_an_arc_that_tells_nothing_is_told_from_the_least_certain_one_between_areas():
+def test_an_arc_that_has_no_information_is_distinguished_from_the_least_certain_one_between_areas():
     assert is_uninformative(uninformative_belief(np.array([3.0, 4.0, 1.0])))
     assert not is_uninformative(PoseGaussian(np.zeros(3), np.diag([100.0, 100.0, 1.0]) ** 2))

@@ -12,7 +12,7 @@ DRIFT = np.array([0.002, -0.001, 0.0012])  # m, m, rad per keyframe
 
 
 def around_the_ring():
-    """Once around and a few metres further; the best hypothesis is accepted between cuts until the ring closes."""
+    """Once around and a few meters further; the best hypothesis is accepted between cuts until the ring closes."""
     run = Run(RING, DRIFT, field_of_view=2 * np.pi, beams=241)
     poses = ring_drive(112)
     for k, pose in enumerate(poses):
@@ -61,7 +61,7 @@ def test_the_arc_that_closes_the_ring_is_precise(ring):
     assert away @ np.linalg.solve(value.pose.covariance, away) < 16.3
 
 
-def test_two_runs_say_the_same_to_the_bit(ring):
+def test_two_runs_are_the_same_to_the_bit(ring):
     run, _ = ring
     again, _ = around_the_ring()
     for a, b in zip(run.answers, again.answers, strict=True):

@@ -167,7 +167,7 @@ def ring_with_two_leaves(apart=1.0):
 
 
 def split_in_two(run, apart):
-    """Leaf 1 where the robot is, leaf 2 at the pose ``apart`` from there."""
+    """Hypothesis 1 where the robot is, hypothesis 2 at the pose ``apart`` from there."""
     split = Hypotheses(len(run.answers) - 1, (Hypothesis(1, 0, 0.6, 0), Hypothesis(2, 0, 0.4, 0)))
     for replica in (run.replica, run.tsbi._replica):
         replica.apply_hypotheses(split)
@@ -187,7 +187,7 @@ def test_the_evidence_of_the_scans_shifts_the_weights():
     assert after[second] / after[first] == pytest.approx(math.exp(1.5) * before[second] / before[first])
 
 
-def test_hypotheses_that_say_the_same_become_one_with_the_weight_of_both():
+def test_hypotheses_that_are_equivalent_become_one_with_the_weight_of_both():
     run = ring_with_two_leaves(apart=0.2)
     run.evidence = {1: 0.0, 2: 1.5}
     (leaf,) = run.keyframe(run.true_pose).hypotheses

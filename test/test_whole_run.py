@@ -44,7 +44,7 @@ def test_every_scan_is_accounted_for(output, report):
     assert len(read_tum(output / "trajectory_online.tum").stamps) == SCANS
 
 
-def test_the_loop_becomes_several_areas_and_its_end_is_recognised(report):
+def test_the_loop_becomes_several_areas_and_its_end_is_recognized(report):
     assert report["areas"] >= 3
     assert report["loop_closures"] >= 1
     assert report["hypotheses"]["probability"] > 0.99
@@ -92,7 +92,7 @@ def revisit_overlap(output, shift=(0.0, 0.0, 0.0)):
     return np.median(shares)
 
 
-def test_where_the_robot_drives_its_first_metres_again_the_walls_are_single(output):
+def test_where_the_robot_drives_its_first_meters_again_the_walls_are_single(output):
     overlap = revisit_overlap(output)
     assert overlap > 0.75
     for shift in [(0.0, 0.1, 0.0), (0.1, 0.0, 0.0), (0.0, 0.0, 0.03)]:
