@@ -37,7 +37,7 @@ POLICY = (
     "Doors are the open doors on the path, crossings the intersections of hallways; each counts once, and is found if "
     f"the path changes areas within {NEAR:g} m of the door, or of the crossing's border. Corners of hallways and halls "
     "have openings, too, which are no doors. So a portal is true if there is any gap between walls within "
-    f"{PORTAL:g} m, to which its error is measured. The error of the pose is that of RTL in the map, mean over drive and "
+    f"{PORTAL:g} m, to which its error is measured. The error of the pose is RTL's in the map, mean over drive and "
     "runs. Closures and loops are defined as in `loops`. " + RELATIONS
 )
 

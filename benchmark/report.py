@@ -175,7 +175,7 @@ def describe_circumstances(seeds: Sequence[int], jobs: int, changes: Sequence[st
     return {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "commit": describe_commit(),
-        "machine": f"{_processor_name()}, {os.cpu_count()} cores, {_memory_bytes() / 2**30:.1f} GiB, {platform.system()}",
+        "machine": f"{_processor_name()}, {os.cpu_count()} cores, {_memory_gib():.1f} GiB, {platform.system()}",
         "versions": ", ".join(
             [f"Python {platform.python_version()}", *(f"{name} {version(name)}" for name in _LIBRARIES)]
         ),
@@ -224,9 +224,9 @@ def _processor_name() -> str:
     return next(names, platform.processor() or platform.machine())
 
 
-def _memory_bytes() -> int:
-    """Memory of the machine, bytes."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+def _memory_gib() -> float:
+    """Memory of the machine, GiB."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
 
 
 def document_marks(kind: str) -> tuple[str, str]:

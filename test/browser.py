@@ -154,13 +154,13 @@ class Page:
 
     def until(self, condition):
         """Wait for it; the page is polled a few times a second."""
-        asked = 0.0
+        requested = 0.0
 
         def due():
-            nonlocal asked
-            if time.monotonic() - asked < 0.3:
+            nonlocal requested
+            if time.monotonic() - requested < 0.3:
                 return False
-            asked = time.monotonic()
+            requested = time.monotonic()
             return condition()
 
         self._listener.until(due, seconds=120.0, alive=self._nodes)
@@ -184,7 +184,7 @@ class Page:
             self.browser.send("Input.dispatchTouchEvent", type=kind, touchPoints=points)
         self.browser.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
-    def colours(self, canvas):
+    def colors(self, canvas):
         """How many different ones there are on a canvas."""
         return self.browser.evaluate(
             f"""(() => {{

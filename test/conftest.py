@@ -71,11 +71,11 @@ class Listener:
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
 
-    def hear(self, kind, topic, profile):
+    def subscribe(self, kind, topic, profile):
         """Subscribe; the list that is returned fills up."""
-        heard = []
-        self.node.create_subscription(kind, topic, heard.append, profile)
-        return heard
+        received = []
+        self.node.create_subscription(kind, topic, received.append, profile)
+        return received
 
     def until(self, condition, seconds=WAIT, alive=()):
         """Spin until a condition holds; fail where it does not, or where one of the processes ends before."""

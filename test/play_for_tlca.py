@@ -32,7 +32,7 @@ class Play:
         self.k = -1
         self.notices = []
 
-    def step(self, *leaves, places=None, world=HOME, traveled=None):
+    def step(self, *hypotheses, places=None, world=HOME, traveled=None):
         """One keyframe event: ``places`` are (hypothesis, area, area_T_base) before it, ``hypotheses`` TSBI's answer.
 
         Without places the keyframe is at the origin of the robot's area, and is the first of an area that is new.
@@ -41,24 +41,24 @@ class Play:
         if places is None:
             replica = self.process._replica
             places = [(h, area, np.zeros(3)) for h, area in replica.robot_areas.items()]
-            leaves = [self._with_first_keyframe(leaf, replica) for leaf in leaves]
+            hypotheses = [self._with_first_keyframe(child, replica) for child in hypotheses]
         estimates = tuple(
             HypothesisEstimate(h, area, belief(pose), True, 0.0, 0.0, Clutter(), 12.0) for h, area, pose in places
         )
         traveled = 0.5 * self.k if traveled is None else traveled
         assert self.process.handle(Keyframe(self.k, worlds.scan_at(WORLD, world), traveled, estimates)) == []
-        said = self.process.handle(Hypotheses(self.k, tuple(leaves) or (Hypothesis(0, 0, 1.0, 0),)))
-        verdicts = [message for message in said if isinstance(message, ClosureDecision)]
-        self.notices += [message for message in said if isinstance(message, Notice)]
+        messages = self.process.handle(Hypotheses(self.k, tuple(hypotheses) or (Hypothesis(0, 0, 1.0, 0),)))
+        verdicts = [message for message in messages if isinstance(message, ClosureDecision)]
+        self.notices += [message for message in messages if isinstance(message, Notice)]
         assert len(verdicts) == 1
         assert verdicts[0].sequence == self.k
         return verdicts[0]
 
-    def _with_first_keyframe(self, leaf, replica):
-        if leaf.moved_keyframes or leaf.area in (0, *replica.maps[leaf.parent].area_ids()):
-            return leaf
+    def _with_first_keyframe(self, child, replica):
+        if child.moved_keyframes or child.area in (0, *replica.maps[child.parent].area_ids()):
+            return child
         return replace(
-            leaf, moved_keyframes=(MovedKeyframe(self.k, replica.robot_areas[leaf.parent], leaf.area, np.zeros(3)),)
+            child, moved_keyframes=(MovedKeyframe(self.k, replica.robot_areas[child.parent], child.area, np.zeros(3)),)
         )
 
     def start(self):

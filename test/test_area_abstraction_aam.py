@@ -38,8 +38,8 @@ def estimate(hypothesis, area, pose, stored=True):
     return HypothesisEstimate(hypothesis, area, exact(pose), stored, 0.0, 0.0, Clutter(), 12.0)
 
 
-def keyframe(k, world_pose, *leaves):
-    return Keyframe(k, worlds.scan_at(WORLD, world_pose), 0.5 * k, leaves)
+def keyframe(k, world_pose, *children):
+    return Keyframe(k, worlds.scan_at(WORLD, world_pose), 0.5 * k, children)
 
 
 def stay(k, *hypotheses, area=0):
@@ -184,8 +184,8 @@ def drive_back(process):
     """Drive back into the first room over known ground until something happens; (keyframe, world pose, event)."""
     back = worlds.drive((7.5, 2.0), (7.5, 3.0), (5.0, 3.0), (1.0, 2.0))
     for k, pose in enumerate(back, start=answered_in_first_room(process)):
-        leaf = estimate(0, 1, se2.between(THERE[0], pose), stored=False)
-        (answer,) = process.handle(keyframe(k, pose, leaf))
+        child = estimate(0, 1, se2.between(THERE[0], pose), stored=False)
+        (answer,) = process.handle(keyframe(k, pose, child))
         if answer.events:
             return k, pose, answer.events[0]
         process.handle(stay(k, 0, area=1))
@@ -203,8 +203,8 @@ def moves_about(process, poses):
     """The areas that the robot moves into while it goes to and fro on known ground, at first in area 1."""
     area, moves = 1, []
     for k, pose in enumerate(poses, start=answered_in_first_room(process)):
-        leaf = estimate(0, area, se2.between(THERE[0], pose), stored=False)
-        (answer,) = process.handle(keyframe(k, pose, leaf))
+        child = estimate(0, area, se2.between(THERE[0], pose), stored=False)
+        (answer,) = process.handle(keyframe(k, pose, child))
         moves += [event.area for event in answer.events]
         area = moves[-1] if moves else 1
         process.handle(stay(k, 0, area=area))

@@ -32,8 +32,8 @@ def configured(policy, **changes):
 def looking_ahead(process, poses=THROUGH, first=0):
     """The event of the first cut, where the laser sees half a circle; and its keyframe."""
     for k, pose in enumerate(poses[first:], start=first):
-        leaf = estimate(0, 0, se2.between(poses[0], pose))
-        (answer,) = process.handle(Keyframe(k, worlds.scan_in(WORLD, pose, beams=361), 0.5 * k, (leaf,)))
+        hypothesis = estimate(0, 0, se2.between(poses[0], pose))
+        (answer,) = process.handle(Keyframe(k, worlds.scan_in(WORLD, pose, beams=361), 0.5 * k, (hypothesis,)))
         if answer.events:
             return answer.events[0], k
         process.handle(stay(k, 0))
@@ -86,8 +86,8 @@ def test_areas_with_an_opening_between_them_are_not_one(policy, merged):
     process.handle(ClosureDecision(k, 0, (arc,)))
     changed = {"ncut_threshold": 0.3, "overlap_radius": 2.0, "min_cluster": 5, "portal_factor": 0.01}
     process = area_abstraction(configured(policy, **changed), process.state)
-    leaf = estimate(0, 1, poses[k], stored=False)
-    (answer,) = process.handle(keyframe(k + 1, THROUGH[k], leaf))
+    hypothesis = estimate(0, 1, poses[k], stored=False)
+    (answer,) = process.handle(keyframe(k + 1, THROUGH[k], hypothesis))
     assert [event.kind for event in answer.events] == ["merged"] * merged
 
 

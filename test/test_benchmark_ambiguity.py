@@ -11,24 +11,30 @@ from benchmark.ambiguity import (
     WRONG,
     Reentry,
     Verdict,
+    decision_table,
     judge_reentry,
     requirements,
-    decision_table,
     trace_hypotheses,
 )
-from benchmark.simulated.loops import Loop, looks_alike, odometry_probabilities, find_rivalries
+from benchmark.simulated.loops import Loop, find_rivalries, looks_alike, odometry_probabilities
 from benchmark.simulated.truth import Truth
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation import open_simulated
 
 
 def hypothesis(hypothesis, parent, probability, right=0, wrong=0):
-    told = {"hypothesis": hypothesis, "parent": parent, "probability": probability}
-    return told | {"samples": 10.0 * probability, "right": right, "wrong": wrong}
+    reported = {"hypothesis": hypothesis, "parent": parent, "probability": probability}
+    return reported | {"samples": 10.0 * probability, "right": right, "wrong": wrong}
 
 
-def entry(event, *leaves):
-    return {"event": event, "stamp": 10**9 * event, "traveled": 0.5 * event, "unexamined": 0.0, "hypotheses": list(leaves)}
+def entry(event, *hypotheses):
+    return {
+        "event": event,
+        "stamp": 10**9 * event,
+        "traveled": 0.5 * event,
+        "unexamined": 0.0,
+        "hypotheses": list(hypotheses),
+    }
 
 
 PMF = [
@@ -114,9 +120,9 @@ def test_requirements_hold_only_where_all_undecided_are_alive_and_all_are_decide
     good = Verdict(True, 0.3, 0.7, 0.5, 0.7, 0.5, 1.0)
     late = Verdict(True, None, None, None, None, 0.0, 1.0)
     decided_unasked = reentry(1.0, Verdict(False, None, None, None, None, None, 0.0))
-    assert all(asked.met for asked in requirements("twins", [reentry(0.4, good), decided_unasked]))
+    assert all(requirement.met for requirement in requirements("twins", [reentry(0.4, good), decided_unasked]))
     assert [a.met for a in requirements("twins", [reentry(0.4, good), reentry(0.9, late)])] == [True, False, True]
-    assert [asked.met for asked in requirements("ring", [reentry(1.0, late)])] == [False, True]
+    assert [requirement.met for requirement in requirements("ring", [reentry(1.0, late)])] == [False, True]
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +183,10 @@ def test_a_world_without_identical_places_has_no_rivalry():
 
 def test_the_table_has_the_path_until_the_true_place_is_sure():
     slow = [entry(0, hypothesis(0, 0, 1.0)), entry(1, hypothesis(2, 0, 0.5, right=1), hypothesis(3, 0, 0.5, wrong=1))]
-    slow += [entry(k, hypothesis(2, 2, min(1.0, 0.5 + 0.04 * k)), hypothesis(3, 3, max(0.0, 0.5 - 0.04 * k))) for k in range(2, 60)]
+    slow += [
+        entry(k, hypothesis(2, 2, min(1.0, 0.5 + 0.04 * k)), hypothesis(3, 3, max(0.0, 0.5 - 0.04 * k)))
+        for k in range(2, 60)
+    ]
     moments = trace_hypotheses(slow, 0)
     rivalry = {"event": 0, "evidence": 1, "by_odometry": 0.6}
     found = [Reentry({"family": "twins"}, rivalry, moments, judge_reentry(moments, 1))]

@@ -69,7 +69,10 @@ def test_scans_and_stamps_stay_and_one_seed_gives_one_log(kind):
     for reading, other_reading in zip(readings(worse), readings(again), strict=True):
         np.testing.assert_array_equal(reading.pose, other_reading.pose)
     if kind not in {"none", "missing"}:
-        assert any((reading.pose != other_reading.pose).any() for reading, other_reading in zip(readings(worse), readings(other), strict=True))
+        assert any(
+            (reading.pose != other_reading.pose).any()
+            for reading, other_reading in zip(readings(worse), readings(other), strict=True)
+        )
 
 
 @pytest.mark.parametrize(("kind", "factor"), [("noise-2x", np.sqrt(3.0)), ("noise-4x", np.sqrt(15.0))])

@@ -23,8 +23,8 @@ def run(end, text="go room 1: the robot is there", offset=(0.0, 0.0, 0.0), conta
     return TaskRun(text, np.array([(3.0, 14.0), end]), 20.0, contacts, [start])
 
 
-def values(*errands):
-    scored = [_score_task(BUILDING, task, "room 1") for task in errands]
+def values(*goals):
+    scored = [_score_task(BUILDING, task, "room 1") for task in goals]
     return {task.name: (task.value, task.met) for task in requirements(scored)}
 
 

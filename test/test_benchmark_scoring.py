@@ -85,8 +85,8 @@ def test_each_requirement_fails_on_its_own_figure(tmp_path, log, change, unmet):
 def test_the_bounds_are_those_that_the_project_promises():
     assert (BOUNDS["aces"].translation, BOUNDS["aces"].rotation) == (0.043, 0.9)
     assert (BOUNDS["intel"].translation, BOUNDS["intel"].rotation) == (0.022, 0.8)
-    asked = speed_requirements("intel", [26.0, 23.0], [350 * 10**6])
-    assert [(one.name, one.met) for one in asked] == [("intel: CPU time", True), ("intel: peak memory", True)]
+    query = speed_requirements("intel", [26.0, 23.0], [350 * 10**6])
+    assert [(one.name, one.met) for one in query] == [("intel: CPU time", True), ("intel: peak memory", True)]
     assert not speed_requirements("intel", [26.0, 25.0], [1])[0].met
     assert not speed_requirements("intel", [1.0], [1, 351 * 10**6])[1].met
     assert not speed_requirements("aces", [15.1], [1])[0].met

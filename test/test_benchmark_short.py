@@ -73,7 +73,9 @@ def test_a_regression_of_the_bundled_log_fails_the_command(tmp_path, monkeypatch
     monkeypatch.setattr(short, "PARTS", (Part("malaga", 0.0, 1), *PARTS[1:]))
     assert main(["short", "--out", str(tmp_path / "report")]) == 1
     requirements = json.loads((tmp_path / "report" / "short.json").read_text())["requirements"]
-    assert [asked["name"] for asked in requirements if not asked["met"]] == ["malaga: disagreement, mean of 1"]
+    assert [requirement["name"] for requirement in requirements if not requirement["met"]] == [
+        "malaga: disagreement, mean of 1"
+    ]
     assert len(requirements) == 4
     assert "Skipped aces: aces.clf.xz is not in" in (tmp_path / "report" / "short.md").read_text()
 

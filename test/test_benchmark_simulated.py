@@ -63,10 +63,10 @@ def second_lap(truth, keyframes):
     return early[int(np.argmin(distances))], late
 
 
-def claim_with_error(truth, known, asked, error, covariance=TIGHT):
+def placement_with_error(truth, known, requirement, error, covariance=TIGHT):
     """The placement that joins the frames of two keyframes, moved by an error."""
-    pose = se2.compose(se2.between(truth.poses[known], truth.poses[asked]), np.array(error))
-    return truth.claim({known: np.zeros(3)}, {asked: pose}, covariance, pose)
+    pose = se2.compose(se2.between(truth.poses[known], truth.poses[requirement]), np.array(error))
+    return truth.claim({known: np.zeros(3)}, {requirement: pose}, covariance, pose)
 
 
 def test_the_long_world_is_2_km_of_nested_loops_and_no_family():
@@ -77,26 +77,26 @@ def test_the_long_world_is_2_km_of_nested_loops_and_no_family():
 
 def test_a_placement_is_true_where_the_places_meet(drive):
     truth, keyframes = drive
-    known, asked = second_lap(truth, keyframes)
-    exact = claim_with_error(truth, known, asked, (0.0, 0.0, 0.0))
+    known, requirement = second_lap(truth, keyframes)
+    exact = placement_with_error(truth, known, requirement, (0.0, 0.0, 0.0))
     assert exact.true
-    assert exact.pair == (known, asked)
+    assert exact.pair == (known, requirement)
     assert exact.translation == pytest.approx(0.0, abs=1e-9)
-    assert claim_with_error(truth, known, asked, (0.45, 0.0, 0.1)).true
-    assert not claim_with_error(truth, known, asked, (0.0, 0.0, 0.2)).true
+    assert placement_with_error(truth, known, requirement, (0.45, 0.0, 0.1)).true
+    assert not placement_with_error(truth, known, requirement, (0.0, 0.0, 0.2)).true
     # Up to 2 m where its covariance admits the error.
-    assert not claim_with_error(truth, known, asked, (1.5, 0.0, 0.0)).true
-    assert claim_with_error(truth, known, asked, (1.5, 0.0, 0.0), np.diag([1.0, 0.01, 0.01])).true
-    assert not claim_with_error(truth, known, asked, (2.5, 0.0, 0.0), np.diag([4.0, 0.01, 0.01])).true
+    assert not placement_with_error(truth, known, requirement, (1.5, 0.0, 0.0)).true
+    assert placement_with_error(truth, known, requirement, (1.5, 0.0, 0.0), np.diag([1.0, 0.01, 0.01])).true
+    assert not placement_with_error(truth, known, requirement, (2.5, 0.0, 0.0), np.diag([4.0, 0.01, 0.01])).true
 
 
 def test_a_placement_that_joins_what_is_apart_is_false_however_right_its_pose(drive):
     truth, keyframes = drive
     far = next(k.sequence for k in keyframes if k.path_length > 20.0)
-    claim = claim_with_error(truth, 0, far, (0.0, 0.0, 0.0))
-    assert claim.translation == pytest.approx(0.0, abs=1e-9)
-    assert not claim.same_place
-    assert not claim.true
+    placement = placement_with_error(truth, 0, far, (0.0, 0.0, 0.0))
+    assert placement.translation == pytest.approx(0.0, abs=1e-9)
+    assert not placement.same_place
+    assert not placement.true
 
 
 def test_a_loop_is_found_where_the_second_lap_begins_and_closed_where_the_map_joins_it(drive):

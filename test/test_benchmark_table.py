@@ -45,7 +45,7 @@ def test_accuracy_is_equal_up_to_a_factor_or_a_centimeter():
 )
 def test_the_campus_requests_ratios_of_the_last_filter_that_was_tried(last, met):
     found = Comparison(OURS, (method(12, 11.0, 220.0, 1.0), method(*last)), {}, "truth")
-    assert [asked.met for asked in requirements(found)] == met
+    assert [requirement.met for requirement in requirements(found)] == met
     assert ("not as accurate" in requirements(found)[1].name) == (not found.equal)
     assert comparison_table({"campus": found}).count("metric RBPF") == 2
 
@@ -90,7 +90,7 @@ def test_with_one_area_nothing_is_ever_left():
     assert all(
         len(message.hypotheses) == 1 for message in recorder.hypotheses.values() if isinstance(message, Hypotheses)
     )
-    assert {leaf.area for message in recorder.hypotheses.values() for leaf in message.hypotheses} == {0}
+    assert {hypothesis.area for message in recorder.hypotheses.values() for hypothesis in message.hypotheses} == {0}
 
 
 def test_one_area_answers_keyframes_alone():

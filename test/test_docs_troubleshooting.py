@@ -31,7 +31,7 @@ def wording(node):
     return None
 
 
-def said(tree):
+def sent(tree):
     """Of calls."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and getattr(node.func, "id", getattr(node.func, "attr", "")) in SAID_BY:
@@ -54,7 +54,7 @@ def messages():
     found = set()
     for path in PACKAGE.rglob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        found |= {text for text in said(tree) if len(text.split()) >= FEWEST_WORDS}
+        found |= {text for text in sent(tree) if len(text.split()) >= FEWEST_WORDS}
         if not OTHER & set(path.relative_to(PACKAGE).parts):
             found |= set(kept(tree))
     return sorted(found)
@@ -83,6 +83,6 @@ def test_every_message_has_an_entry():
 
 
 def test_every_entry_has_a_message():
-    said = messages()
-    stale = [entry for entry in entries() if not any(fits(entry, message) for message in said)]
+    sent = messages()
+    stale = [entry for entry in entries() if not any(fits(entry, message) for message in sent)]
     assert stale == [], "nothing says so any more: take the entries away"

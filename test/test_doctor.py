@@ -329,10 +329,10 @@ def test_the_command_says_what_is_wrong_and_returns_it(drive, tmp_path, capsys):
     log = changed(drive, scan=lambda scan: turned(scan, math.radians(12.0)))
     write_bag(log, tmp_path / "bag")
     assert main(["doctor", str(tmp_path / "bag")]) == 1
-    said = capsys.readouterr().out.splitlines()
-    assert said[0].startswith("wrong    laser yaw: The laser is turned by 1")
-    assert said[-1].startswith("1 wrong, 0 doubtful, ")
-    assert any("Odometry is odom -> base_link, scans are in laser." in line for line in said)
+    sent = capsys.readouterr().out.splitlines()
+    assert sent[0].startswith("wrong    laser yaw: The laser is turned by 1")
+    assert sent[-1].startswith("1 wrong, 0 doubtful, ")
+    assert any("Odometry is odom -> base_link, scans are in laser." in line for line in sent)
     assert main(["doctor", "--json", str(tmp_path / "bag")]) == 1
     found = json.loads(capsys.readouterr().out)["findings"]
     assert [one["subject"] for one in found if one["severity"] == "wrong"] == ["laser yaw"]

@@ -136,11 +136,11 @@ def goes(own: _Explored, *probabilities: float) -> GoalPose | None:
     """
     explorer, atlas = own.run.driver, own.run.driver.exploration_map
     best, area, sequence = atlas.replica.best_hypothesis, atlas.pose.area, max(atlas.replica.scans)
-    leaves = tuple(Hypothesis(best + k, best, share, area) for k, share in enumerate(probabilities))
-    explorer.handle(Hypotheses(sequence, leaves, 0.0))
+    hypotheses = tuple(Hypothesis(best + k, best, share, area) for k, share in enumerate(probabilities))
+    explorer.handle(Hypotheses(sequence, hypotheses, 0.0))
     explorer.handle(ClosureDecision(sequence, None, (), ()))
-    said = explorer.handle(replace(scan_at((1.0, 0.0, 0.0)), stamp=atlas.pose.stamp))
-    return next((word for word in said if isinstance(word, GoalPose)), None)
+    messages = explorer.handle(replace(scan_at((1.0, 0.0, 0.0)), stamp=atlas.pose.stamp))
+    return next((word for word in messages if isinstance(word, GoalPose)), None)
 
 
 def test_it_turns_back_while_several_topological_paths_are_probable() -> None:
@@ -173,9 +173,11 @@ def test_scans_may_come_after_any_message_of_the_chain() -> None:
     replica, pose = atlas.replica, atlas.pose
     new = max(replica.scans) + 1
     scan = replace(scan_at((1.0, 0.0, 0.0)), stamp=pose.stamp)
-    leaf = HypothesisEstimate(replica.best_hypothesis, pose.area, pose.pose_in_area, True, 0.0, 0.0, Clutter(), 12.0)
+    hypothesis = HypothesisEstimate(
+        replica.best_hypothesis, pose.area, pose.pose_in_area, True, 0.0, 0.0, Clutter(), 12.0
+    )
     explorer.handle(scan)
-    explorer.handle(Keyframe(new, scan, 0.0, (leaf,)))
+    explorer.handle(Keyframe(new, scan, 0.0, (hypothesis,)))
     explorer.handle(Task("explore"))
     assert explorer.handle(scan)
     assert new in atlas.roadmap.graph

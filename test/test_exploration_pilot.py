@@ -42,20 +42,20 @@ class Robot:
     def __init__(self, missions, pose, rtl="always"):
         self.missions, self.pose, self.odometry, self.rtl = missions, np.array(pose), np.zeros(3), rtl
         self.rng, self.stamp = np.random.default_rng(0), BEGIN
-        self.velocity, self.said = np.zeros(3), []
+        self.velocity, self.sent = np.zeros(3), []
         self.slip = 1.0
 
-    def hear(self, message):
-        said = self.missions.handle(message)
-        self.said += said
-        for answer in said:
+    def handle_all(self, message):
+        messages = self.missions.handle(message)
+        self.sent += messages
+        for answer in messages:
             if isinstance(answer, VelocityCommand):
                 self.velocity = np.array([answer.speed, 0.0, answer.turn_rate])
             if isinstance(answer, PoseReset) and self.rtl == "door":
                 self.rtl = "always"
-        return said
+        return messages
 
-    def told(self):
+    def rtl_pose(self):
         """What RTL says."""
         area = int(self.pose[0] > 8.0)
         pose = se2.between(AREAS[area], self.pose)
@@ -74,31 +74,31 @@ class Robot:
 
     def step(self, velocity=None):
         """Odometry, pose and scan, and on; what the pilot says."""
-        said = self.hear(replace(seen_at(self.pose, self.rng), stamp=self.stamp))
-        said += self.hear(Odometry(self.stamp, self.odometry))
+        messages = self.handle_all(replace(seen_at(self.pose, self.rng), stamp=self.stamp))
+        messages += self.handle_all(Odometry(self.stamp, self.odometry))
         if self.rtl != "never":
-            said += self.hear(self.told())
+            messages += self.handle_all(self.rtl_pose())
         increment = se2.exp(PERIOD * (self.velocity if velocity is None else np.array(velocity)))
         rolled = increment * (self.slip if self.pose[1] > 1.0 else 1.0)
         self.pose, self.odometry = se2.compose(self.pose, increment), se2.compose(self.odometry, rolled)
         self.stamp += round(1e9 * PERIOD)
-        return said
+        return messages
 
     def do(self, text, steps=600):
         """How a task ends."""
-        said = self.hear(parse_task(text, PILOT_TASKS))
+        messages = self.handle_all(parse_task(text, PILOT_TASKS))
         for _ in range(steps):
-            for answer in said:
+            for answer in messages:
                 if isinstance(answer, TaskResult):
                     return answer
-            said = self.step()
+            messages = self.step()
         return None
 
     def starts(self):
-        return [message.initial_pose for message in self.said if isinstance(message, PoseReset)]
+        return [message.initial_pose for message in self.sent if isinstance(message, PoseReset)]
 
     def estimate(self):
-        return next(message for message in reversed(self.said) if isinstance(message, PlaceEstimate))
+        return next(message for message in reversed(self.sent) if isinstance(message, PlaceEstimate))
 
 
 def off(place, pose):
@@ -116,7 +116,7 @@ def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_unti
     outcome = robot.do("go cellar")
     assert (outcome.succeeded, outcome.text) == (False, f"go cellar: there is no such room: choose from {room}")
     stood = []
-    robot.hear(parse_task(f"go {room}", PILOT_TASKS))
+    robot.handle_all(parse_task(f"go {room}", PILOT_TASKS))
     while not robot.starts():
         stood.append(robot.pose)
         robot.step()
@@ -127,8 +127,8 @@ def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_unti
     assert (outcome.succeeded, outcome.text) == (True, f"go {room}: the robot is there")
     assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
     assert len(robot.starts()) == 1
-    said = robot.estimate()
-    assert (said.place, said.room, said.confident) == (room.replace("room", "door"), room, True)
+    messages = robot.estimate()
+    assert (messages.place, messages.room, messages.confident) == (room.replace("room", "door"), room, True)
     np.testing.assert_array_equal(robot.velocity, 0.0)
     assert robot.do("localize").text == f"localize: the robot is in {room}"
     assert robot.do(f"go {room}").succeeded
@@ -148,7 +148,7 @@ def test_a_robot_that_metric_slam_does_not_find_behind_the_door_goes_by_the_map_
     robot.slip = 1.2
     assert robot.do(f"go {room}").succeeded
     assert len(robot.starts()) == 1
-    (heading,) = {message for message in robot.said if isinstance(message, GoalPose)}
+    (heading,) = {message for message in robot.sent if isinstance(message, GoalPose)}
     place = se2.compose(AREAS[heading.area], heading.pose)
     np.testing.assert_allclose(place, (5.0, 3.0, 0.5 * math.pi), atol=0.1)
     assert math.dist(robot.pose[:2], place[:2]) < 0.2
@@ -157,7 +157,7 @@ def test_a_robot_that_metric_slam_does_not_find_behind_the_door_goes_by_the_map_
 def test_where_metric_slam_has_the_robot_elsewhere_the_belief_restarts_and_no_door_is_entered(saved):
     missions = PilotProcess(CONFIGURATION, saved)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="elsewhere"), the_room(missions)
-    robot.hear(parse_task(f"go {room}", PILOT_TASKS))
+    robot.handle_all(parse_task(f"go {room}", PILOT_TASKS))
     confident = []
     for _ in range(250):
         robot.step()
@@ -176,7 +176,7 @@ def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_onc
     missions = PilotProcess(configuration, saved)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="never"), the_room(missions)
     assert "pilot.drives is false" in robot.do(f"go {room}").text
-    robot.said.clear()
+    robot.sent.clear()
     robot.step()
     assert robot.estimate().place is None
     while robot.pose[0] > 5.0:
@@ -191,7 +191,7 @@ def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_onc
             (place,) = robot.starts()
             assert np.abs(off(place, at[-1])).max() < 0.1
     assert len(robot.starts()) == 1
-    assert not any(isinstance(message, VelocityCommand) for message in robot.said)
+    assert not any(isinstance(message, VelocityCommand) for message in robot.sent)
 
 
 def test_it_finds_out_where_it_is_and_stops_on_request_or_when_it_takes_too_long(saved):
@@ -199,9 +199,9 @@ def test_it_finds_out_where_it_is_and_stops_on_request_or_when_it_takes_too_long
     robot = Robot(missions, (14.0, 0.0, math.pi), rtl="never")
     assert robot.do("localize").text == "localize: given up after 2 s"
     np.testing.assert_array_equal(robot.velocity, 0.0)
-    robot.hear(parse_task("localize", PILOT_TASKS))
+    robot.handle_all(parse_task("localize", PILOT_TASKS))
     robot.step()
-    robot.hear(parse_task("stop", PILOT_TASKS))
+    robot.handle_all(parse_task("stop", PILOT_TASKS))
     np.testing.assert_array_equal(robot.velocity, 0.0)
     assert not any(isinstance(message, VelocityCommand) for message in robot.step())
     robot = Robot(PilotProcess(CONFIGURATION, saved), (14.0, 0.0, math.pi), rtl="never")
@@ -214,7 +214,7 @@ def test_where_time_goes_back_the_robot_may_be_anywhere(saved):
     missions = PilotProcess(CONFIGURATION, saved)
     robot = Robot(missions, (12.0, 0.0, math.pi), rtl="never")
     assert robot.do("localize").succeeded
-    robot.hear(parse_task("localize", PILOT_TASKS))
+    robot.handle_all(parse_task("localize", PILOT_TASKS))
     robot.stamp -= 3_000_000_000
     assert [answer.text for answer in robot.step() if isinstance(answer, TaskResult)] == [
         "localize: given up: time went back"
@@ -234,8 +234,8 @@ def test_one_who_drives_the_robot_out_of_a_room_brings_it_before_the_door(saved)
         robot.step((0.5, 0.0, turn))
     for _ in range(2):
         robot.step((0.0, 0.0, 0.0))
-    said = robot.estimate()
-    assert (said.place, said.room, said.confident) == (room.replace("room", "door"), None, True)
+    messages = robot.estimate()
+    assert (messages.place, messages.room, messages.confident) == (room.replace("room", "door"), None, True)
 
 
 def test_a_map_without_places_is_refused():

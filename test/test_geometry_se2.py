@@ -51,8 +51,8 @@ def test_the_doubles_next_to_half_a_turn_wrap_inside_the_interval():
     for turns in range(-6, 7, 2):
         for edge in (-math.pi, math.pi):
             angle = edge + turns * math.pi
-            for neighbour in (np.nextafter(angle, -np.inf), angle, np.nextafter(angle, np.inf)):
-                assert -math.pi <= float(se2.wrap(neighbour)) < math.pi
+            for neighbor in (np.nextafter(angle, -np.inf), angle, np.nextafter(angle, np.inf)):
+                assert -math.pi <= float(se2.wrap(neighbor)) < math.pi
 
 
 @given(angles)

@@ -32,7 +32,7 @@ def drawn(scans: list[Scan], poses: list, max_range: float = 10.0) -> OccupancyI
     return occupancy_image(scans, np.array(poses, dtype=float), 0.1, max_range)
 
 
-def colour(image: OccupancyImage, x: float, y: float) -> int:
+def color(image: OccupancyImage, x: float, y: float) -> int:
     column = int(np.floor((x - image.origin[0]) / image.resolution))
     row = image.pixels.shape[0] - 1 - int(np.floor((y - image.origin[1]) / image.resolution))
     return int(image.pixels[row, column])
@@ -40,7 +40,7 @@ def colour(image: OccupancyImage, x: float, y: float) -> int:
 
 def test_one_beam_clears_its_way_and_blackens_its_end() -> None:
     image = drawn([beam(2.05)], [[0.05, 0.05, 0.0]])
-    along = [colour(image, 0.05 + 0.1 * k, 0.05) for k in range(-1, 23)]
+    along = [color(image, 0.05 + 0.1 * k, 0.05) for k in range(-1, 23)]
     assert along == [UNKNOWN, *[FREE] * 20, OCCUPIED, UNKNOWN, UNKNOWN]
     assert (image.pixels == OCCUPIED).sum() == 1
     assert (image.pixels == FREE).sum() == 20
@@ -65,20 +65,20 @@ def test_a_beam_crosses_the_cells_that_a_fine_walk_along_it_meets() -> None:
 def test_a_beam_without_a_return_has_no_information(value: float) -> None:
     image = drawn([beam(1.0, value, increment=np.pi / 2)], [AHEAD])
     assert (image.pixels == OCCUPIED).sum() == 1
-    assert colour(image, 0.05, 0.35) == UNKNOWN
+    assert color(image, 0.05, 0.35) == UNKNOWN
 
 
 def test_a_beam_beyond_the_range_clears_only() -> None:
     image = drawn([beam(8.0)], [[0.05, 0.05, 0.0]], max_range=3.0)
     assert (image.pixels == OCCUPIED).sum() == 0
-    assert colour(image, 2.85, 0.05) == FREE
+    assert color(image, 2.85, 0.05) == FREE
     assert image.pixels.shape[1] * 0.1 < 4.5
 
 
 def test_the_laser_stands_where_its_pose_says() -> None:
     image = drawn([beam(1.0, laser=(0.55, 0.25, np.pi / 2))], [[1.0, 0.0, 0.0]])
-    assert colour(image, 1.55, 1.25) == OCCUPIED
-    assert colour(image, 1.55, 0.75) == FREE
+    assert color(image, 1.55, 1.25) == OCCUPIED
+    assert color(image, 1.55, 0.75) == FREE
 
 
 def test_x_points_right_and_y_points_up() -> None:
@@ -91,13 +91,13 @@ def test_x_points_right_and_y_points_up() -> None:
 
 def test_one_scan_is_one_vote_however_many_beams_cross_a_cell() -> None:
     wall, through = beam(1.0), beam(*[2.0] * 50)
-    assert colour(drawn([wall, through], [AHEAD, AHEAD]), 1.0, 0.0) == OCCUPIED
-    assert colour(drawn([wall, through, through], [AHEAD] * 3), 1.0, 0.0) == FREE
+    assert color(drawn([wall, through], [AHEAD, AHEAD]), 1.0, 0.0) == OCCUPIED
+    assert color(drawn([wall, through, through], [AHEAD] * 3), 1.0, 0.0) == FREE
 
 
 def test_a_hit_goes_before_the_misses_of_the_same_scan() -> None:
     grazing = beam(1.0, 2.0)
-    assert colour(drawn([grazing], [AHEAD]), 1.0, 0.0) == OCCUPIED
+    assert color(drawn([grazing], [AHEAD]), 1.0, 0.0) == OCCUPIED
 
 
 def test_a_map_without_bounds_is_drawn_coarser() -> None:

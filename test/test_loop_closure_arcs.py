@@ -76,8 +76,8 @@ def test_the_same_keyframes_do_not_make_an_arc_more_certain_twice():
     pose = [4.0, 0.0, 0.0]
     play.step(places=[(0, 0, [4.5, 0.0, 0.0])])
     there = MovedKeyframe(1, 0, 1, np.array([0.5, 0.0, 0.0]))
-    leaf = Hypothesis(0, 0, 1.0, 1, belief(se2.inverse(pose)), (there,), (Arc(0, 1, belief(pose)),))
-    play.step(leaf)
+    hypothesis = Hypothesis(0, 0, 1.0, 1, belief(se2.inverse(pose)), (there,), (Arc(0, 1, belief(pose)),))
+    play.step(hypothesis)
     again = MovedKeyframe(1, 1, 1, np.array([0.5, 0.0, 0.0]))
     play.step(Hypothesis(0, 0, 1.0, 1, None, (again,), (Arc(0, 1, belief(pose)),)))
     np.testing.assert_allclose(play.arc(0, 1).covariance, SPREAD, rtol=1e-6, atol=1e-12)

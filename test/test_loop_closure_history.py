@@ -24,12 +24,12 @@ def closing_play(error, spread=SPREAD, refinement=0):
     for i, pose in enumerate(ROOM_B):
         area, where = (0, se2.between(ROOM_A[0], pose)) if i == 0 else (1, se2.between(ROOM_B[0], pose))
         moved = MovedKeyframe(first, 0, 1, np.zeros(3))
-        leaf = (
+        hypothesis = (
             Hypothesis(0, 0, 1.0, 1, belief(se2.inverse(a_T_b)), (moved,), (Arc(0, 1, belief(a_T_b)),))
             if i == 0
             else Hypothesis(0, 0, 1.0, 1)
         )
-        play.step(leaf, places=[(0, area, where)], world=pose)
+        play.step(hypothesis, places=[(0, area, where)], world=pose)
     back = worlds.drive((3.5, 2.0), (2.0, 3.5))
     first = play.k + 1
     for pose in back[:-1]:
@@ -37,8 +37,8 @@ def closing_play(error, spread=SPREAD, refinement=0):
     in_b, in_a = se2.between(ROOM_B[0], back), se2.compose(error, se2.between(ROOM_A[0], back))
     b_T_a = se2.compose(in_b[0], se2.inverse(in_a[0]))
     moved = tuple(MovedKeyframe(first + i, 1, 0, pose) for i, pose in enumerate(in_a))
-    leaf = Hypothesis(0, 0, 1.0, 0, belief(se2.inverse(b_T_a)), moved, (Arc(1, 0, belief(b_T_a, spread), True),))
-    verdict = play.step(leaf, places=[(0, 1, in_b[-1])], world=back[-1])
+    hypothesis = Hypothesis(0, 0, 1.0, 0, belief(se2.inverse(b_T_a)), moved, (Arc(1, 0, belief(b_T_a, spread), True),))
+    verdict = play.step(hypothesis, places=[(0, 1, in_b[-1])], world=back[-1])
     return play, verdict, first, se2.between(ROOM_A[0], back), a_T_b
 
 
@@ -124,9 +124,9 @@ def test_an_arc_that_refuses_to_fit_is_reported_once():
     play.step(Hypothesis(0, 0, 1.0, 0, belief(np.zeros(3)), (), (Arc(3, 0, belief([9.0, 0.0, 0.0])),)))
     assert len(play.notices) >= 1
     assert "between areas" in play.notices[0].text
-    told = {notice.text.split(" misses")[0] for notice in play.notices}
+    reported = {notice.text.split(" misses")[0] for notice in play.notices}
     play.step(new_area(0, 0, 1.0, 4, [2.0, 0.0, 0.0]))
-    assert len(told) == len(play.notices)
+    assert len(reported) == len(play.notices)
 
 
 def test_the_same_messages_give_the_same_verdicts():
@@ -180,8 +180,8 @@ def test_a_question_that_is_open_again_is_closed_as_any_other():
     play = Play(arc_sigma_floor=1e-4, arc_angle_floor=1e-3, accept_distance=0.0, accept_probability=0.98)
     best, second, *_ = two_loops(play, false_closure=True).revised_hypotheses
     assert [(ends.source, ends.target) for ends in second.removed_arcs] == [(0, 4)]
-    leaves = replace(best, id=1, probability=0.99), replace(second, id=2, probability=0.01)
-    assert play.step(*leaves).hypothesis is None
+    hypotheses = replace(best, id=1, probability=0.99), replace(second, id=2, probability=0.01)
+    assert play.step(*hypotheses).hypothesis is None
     both = Hypothesis(1, 1, 0.99, 4), Hypothesis(2, 2, 0.01, 4)
     assert [play.step(*both).hypothesis for _ in range(2)] == [None, 1]
     assert play.arc(0, 2, 1) is None

@@ -74,7 +74,7 @@ def drive_with(*found, areas=8, area=7):
     return account_of(hybrid_map, history, closures, area)
 
 
-def doubt_of(account, event):
+def inconsistency_of(account, event):
     return ClosureConsistencyCheck(account, BOUND, 100).find_inconsistency(
         [c.closure_id for c in account.closures if c.closure_id[0] == event], 0.01
     )
@@ -82,40 +82,40 @@ def doubt_of(account, event):
 
 def test_closures_that_agree_raise_no_inconsistency():
     account = drive_with((80, 7, 0, (0.05, 0.0, 0.0)), (81, 6, 1, (0.0, -0.05, 0.0)), (82, 7, 2, (0.0, 0.0, 0.0)))
-    assert doubt_of(account, 82) is None
+    assert inconsistency_of(account, 82) is None
 
 
 def test_a_false_closure_is_found_when_true_ones_contradict_it():
     """It fits the odometry alone."""
     account = drive_with((80, 6, 0, FALSE))
-    assert doubt_of(account, 80) is None
+    assert inconsistency_of(account, 80) is None
     account = drive_with((80, 6, 0, FALSE), (81, 7, 1, TRUE))
-    doubt = doubt_of(account, 81)
-    assert doubt.closure.closure_id[0] == 81
-    assert doubt.excess_chi2 > BOUND
-    assert [c.closure_id[0] for c in doubt.explanations[0].false_closures] == [80]
-    assert doubt.explanations[0].probability > 0.9
+    inconsistency = inconsistency_of(account, 81)
+    assert inconsistency.closure.closure_id[0] == 81
+    assert inconsistency.excess_chi2 > BOUND
+    assert [c.closure_id[0] for c in inconsistency.explanations[0].false_closures] == [80]
+    assert inconsistency.explanations[0].probability > 0.9
 
 
 def test_where_two_closures_contradict_each_other_both_may_be_false():
     account = drive_with((80, 6, 0, FALSE), (81, 7, 1, (-2.2, 0.0, 0.0)))
-    doubt = doubt_of(account, 81)
-    assert sorted(c.closure_id[0] for e in doubt.explanations for c in e.false_closures) == [80, 81]
-    assert [e.probability for e in doubt.explanations] == pytest.approx([0.5, 0.5], abs=0.01)
+    inconsistency = inconsistency_of(account, 81)
+    assert sorted(c.closure_id[0] for e in inconsistency.explanations for c in e.false_closures) == [80, 81]
+    assert [e.probability for e in inconsistency.explanations] == pytest.approx([0.5, 0.5], abs=0.01)
 
 
 def test_the_odds_at_which_a_closure_was_accepted_speak_for_it():
     account = drive_with((80, 6, 0, FALSE), (81, 7, 1, (-2.2, 0.0, 0.0)))
     closures = (account.closures[0], replace(account.closures[1], log_odds=10.0))
-    doubt = doubt_of(replace(account, closures=closures), 81)
-    assert [[c.closure_id[0] for c in e.false_closures] for e in doubt.explanations] == [[80]]
+    inconsistency = inconsistency_of(replace(account, closures=closures), 81)
+    assert [[c.closure_id[0] for c in e.false_closures] for e in inconsistency.explanations] == [[80]]
 
 
 def test_closures_that_were_accepted_because_of_a_false_one_go_with_it_and_true_ones_stay():
     shifted = (80, 6, 0, FALSE), (81, 6, 1, FALSE), (82, 7, 2, FALSE)
     account = drive_with((79, 3, 0, TRUE), *shifted, (90, 5, 3, TRUE), (91, 7, 4, TRUE))
-    doubt = doubt_of(account, 91)
-    best = doubt.explanations[0]
+    inconsistency = inconsistency_of(account, 91)
+    best = inconsistency.explanations[0]
     assert [c.closure_id[0] for c in best.false_closures] == [80, 81, 82]
     assert best.probability > 0.99
     assert [c.closure_id[0] for c in best.path.closures] == [79, 90, 91]
@@ -302,7 +302,7 @@ def test_tsbi_goes_on_with_the_explanations_as_live_hypotheses():
     assert sorted(r.keyframe for r in one.moved_keyframes) == [5, 6, 7, 8]
     assert sorted(run.replica.maps[one.id].keyframes(0)) == list(range(9))
     assert one.local_areas[0].area == 0
-    assert [leaf.removed_arcs for leaf in run.keyframe(ring_drive(10)[9]).hypotheses] == [(), ()]
+    assert [hypothesis.removed_arcs for hypothesis in run.keyframe(ring_drive(10)[9]).hypotheses] == [(), ()]
 
 
 LOG = "sim:ring,seed=3,size=1.5"
@@ -325,9 +325,9 @@ def test_a_closure_that_was_accepted_falsely_is_withdrawn_when_the_true_one_come
     (without_it, _), (with_it, _) = drives
     accepted = {row.keyframe: row for row in with_it.probabilities if row.accepted}
     assert min(k for k, row in accepted.items() if row.closures) < 80  # definite, long before the true one
-    (told,) = [notice.text for notice in with_it.notices if notice.process == "tlca"]
-    assert "closure between areas 0 and 4 contradicts" in told
-    assert "of all closures 2-0 is taken for false" in told
+    (reported,) = [notice.text for notice in with_it.notices if notice.process == "tlca"]
+    assert "closure between areas 0 and 4 contradicts" in reported
+    assert "of all closures 2-0 is taken for false" in reported
     assert arcs(with_it) == arcs(without_it)
     assert with_it.hybrid_map.arc(0, 2) is None
     assert with_it.replica.probabilities[with_it.replica.best_hypothesis] == 1.0

@@ -77,7 +77,7 @@ def test_branching_again_starts_the_count_again():
         Hypothesis(2, 2, 0.02, 1),
     )
     rest = (Hypothesis(3, 3, 0.92, 2), Hypothesis(4, 4, 0.06, 2), Hypothesis(2, 2, 0.02, 1))
-    assert [play.step(*leaves).hypothesis for leaves in (again, rest, rest)] == [None, None, 3]
+    assert [play.step(*hypotheses).hypothesis for hypotheses in (again, rest, rest)] == [None, None, 3]
 
 
 def test_after_acceptance_only_the_accepted_hypothesis_goes_on():

@@ -64,7 +64,7 @@ class Drive(NamedTuple):
         return float(np.sqrt(np.mean(np.sum(self.errors[:, :2] ** 2, axis=1))))
 
 
-def driven(sweep, told):
+def driven(sweep, reported):
     """A drive with a laser whose sweep takes so many seconds, and says so or not."""
     odometry, dialogue = list(readings()), Dialogue()
     for k in range(SCANS):
@@ -72,7 +72,7 @@ def driven(sweep, told):
         poses = true_pose(begin + sweep * np.linspace(0.0, 1.0, BEAMS))
         stamp = SECOND + round(begin * SECOND)
         scan = scan_in(WALLS, poses, stamp, BEAMS, 1.5 * np.pi, noise=0.01, seed=k, sweep=sweep)
-        dialogue.tell(scan if told else replace(scan, time_increment=0.0))
+        dialogue.tell(scan if reported else replace(scan, time_increment=0.0))
         while odometry and odometry[0].stamp < stamp + PERIOD * SECOND:
             dialogue.tell(odometry.pop(0))
     dialogue.tell(EndOfLog())
@@ -86,7 +86,11 @@ def driven(sweep, told):
 
 @pytest.fixture(scope="module")
 def drives():
-    return {"standing": driven(0.0, told=True), "skewed": driven(0.1, told=False), "deskewed": driven(0.1, told=True)}
+    return {
+        "standing": driven(0.0, reported=True),
+        "skewed": driven(0.1, reported=False),
+        "deskewed": driven(0.1, reported=True),
+    }
 
 
 def test_a_robot_that_turns_while_its_laser_sweeps_is_found_as_if_the_laser_took_no_time(drives):
@@ -111,7 +115,7 @@ def sweeping_scan(index):
 def test_a_scan_waits_until_odometry_covers_its_last_beam():
     dialogue = Dialogue().tell(Odometry(SECOND, np.zeros(3)), sweeping_scan(0))
     dialogue.tell(Odometry(SECOND + SECOND * 8 // 100, np.array([0.08, 0.0, 0.0])))
-    assert not dialogue.said
+    assert not dialogue.sent
     dialogue.tell(Odometry(SECOND + SECOND * 9 // 100, np.array([0.09, 0.0, 0.0])))
     (keyframe,) = dialogue.of(Keyframe)
     np.testing.assert_allclose(keyframe.scan.motion, (0.09, 0.0, 0.0), atol=1e-9)
@@ -120,7 +124,7 @@ def test_a_scan_waits_until_odometry_covers_its_last_beam():
 def test_at_the_end_of_a_log_the_last_sweep_goes_on_as_the_odometry_did():
     dialogue = Dialogue().tell(Odometry(SECOND - SECOND // 10, np.array([-0.1, 0.0, 0.0])))
     dialogue.tell(Odometry(SECOND, np.zeros(3)), sweeping_scan(0))
-    assert not dialogue.said
+    assert not dialogue.sent
     dialogue.tell(EndOfLog())
     np.testing.assert_allclose(dialogue.of(Keyframe)[0].scan.motion, (0.09, 0.0, 0.0), atol=1e-9)
 

@@ -89,9 +89,9 @@ def test_a_robot_that_enters_an_area_is_as_uncertain_in_it_as_the_newest_keyfram
     placed = se2.compose([1.0, 2.0, 0.5], se2.between(reference, newest))
     entry = PoseGaussian(placed, np.diag([sigma, sigma, 0.01]) ** 2)
     rebase = entry.compose(PoseGaussian(se2.inverse(newest), np.zeros((3, 3))))
-    leaf, poses = entered(live, (12, 13, 14, 15), rebase)
+    hypothesis, poses = entered(live, (12, 13, 14, 15), rebase)
     content = [PlacedKeyframe(k, 1, driven.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
-    live.change_area(leaf, content, ParticleFilters(live.filter.mapping))
+    live.change_area(hypothesis, content, ParticleFilters(live.filter.mapping))
     np.testing.assert_allclose(live.filter.pose, entry.mean, atol=1e-9)
     np.testing.assert_allclose(live.event.pose_covariance, entry.covariance, atol=1e-6)
     assert live.pose_belief().covariance[0, 0] >= 0.9 * sigma**2
@@ -102,8 +102,8 @@ def test_a_robot_that_goes_back_into_an_area_is_as_far_off_as_the_map_there_and_
     drive_.along(THERE[1:])
     live, rebase = drive_.live, PoseGaussian(np.array([-1.0, 0.0, 0.0]), np.diag([0.4, 0.4, 0.0]) ** 2)
     before = live.event.pose_covariance
-    leaf, poses = entered(live, (), rebase)
+    hypothesis, poses = entered(live, (), rebase)
     content = [PlacedKeyframe(k, 1, drive_.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
-    live.change_area(leaf, content, ParticleFilters(live.filter.mapping))
+    live.change_area(hypothesis, content, ParticleFilters(live.filter.mapping))
     assert live.event.pose_covariance[0, 0] == pytest.approx(before[0, 0] + 0.16, rel=0.2)
     assert live.event.pose_covariance[1, 1] < 0.05

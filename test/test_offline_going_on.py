@@ -225,17 +225,17 @@ def test_a_log_that_begins_alike_and_is_another_is_refused(first):
 
 def test_a_log_that_goes_on_begins_where_it_began_and_a_further_one_anywhere():
     saved = Configuration()
-    asked = with_changes(saved, {"robot.start": 2.0})
-    assert describe_parameter_changes(saved, asked, further=True) is None
+    requested = with_changes(saved, {"robot.start": 2.0})
+    assert describe_parameter_changes(saved, requested, further=True) is None
     with pytest.raises(HmtSlamError, match=r"made with robot\.start = 0\.0, not with robot\.start = 2\.0"):
-        describe_parameter_changes(saved, asked)
+        describe_parameter_changes(saved, requested)
 
 
 def test_parameters_that_may_change_are_reported_with_both_values():
     saved = with_changes(Configuration(), {"tlca.accept_probability": 0.9, "robot.duration": 60.0})
     assert describe_parameter_changes(saved, with_changes(saved, {"robot.duration": 0.0})) is None
-    told = describe_parameter_changes(saved, with_changes(saved, {"tlca.accept_probability": 0.95, "seed": 4}))
-    assert told == (
+    reported = describe_parameter_changes(saved, with_changes(saved, {"tlca.accept_probability": 0.95, "seed": 4}))
+    assert reported == (
         "goes on with seed = 4 and tlca.accept_probability = 0.95; the map was made with seed = 0 and "
         "tlca.accept_probability = 0.9"
     )

@@ -82,7 +82,7 @@ def test_the_robot_was_lost_at_first_and_then_joined(first, second_log):
         run.process_record(record)
         events = max(run.recorder.hypotheses, default=-1)
         if events >= first.processes["slam"].keyframe_events:
-            lost.append(all(leaf.lost for leaf in run.recorder.hypotheses[events].hypotheses))
+            lost.append(all(hypothesis.lost for hypothesis in run.recorder.hypotheses[events].hypotheses))
     assert lost[0]
     assert not lost[-1]
     joined = lost.index(False)
@@ -143,12 +143,12 @@ def hmt_slam(*words):
 
 def test_the_command_says_whether_the_log_is_a_further_one_and_writes_the_poses_of_all(tmp_path):
     hmt_slam("map", BUNDLED, "--out", tmp_path / "a", "--duration", 6, "--start", 0.5)
-    told = hmt_slam("map", BUNDLED, "--out", tmp_path / "b", "--duration", 9, "--from", tmp_path / "a").stderr
-    assert "malaga_one_loop is the log that the map was made of, of which " in told
-    assert "it is a further one" not in told
+    reported = hmt_slam("map", BUNDLED, "--out", tmp_path / "b", "--duration", 9, "--from", tmp_path / "a").stderr
+    assert "malaga_one_loop is the log that the map was made of, of which " in reported
+    assert "it is a further one" not in reported
     assert not (tmp_path / "b" / "earlier").exists()
-    told = hmt_slam("map", WORLD, "--out", tmp_path / "c", "--duration", 5, "--from", tmp_path / "b").stderr
-    assert "it is a further one" in told
+    reported = hmt_slam("map", WORLD, "--out", tmp_path / "c", "--duration", 5, "--from", tmp_path / "b").stderr
+    assert "it is a further one" in reported
     scans = [len(scans_of(log)) for log in (open_log(BUNDLED, start=0.5, duration=9.0), open_log(WORLD, duration=5.0))]
     for name in ("trajectory", "trajectory_online", "stages/keyframes"):
         assert read_tum(tmp_path / "c" / f"{name}.tum").stamps.size == scans[1]

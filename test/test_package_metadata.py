@@ -229,5 +229,5 @@ def test_foxglove_shows_the_topics_the_nodes_publish():
     paths = [line["value"] for panel in panels.values() for line in panel.get("paths", ())]
     plotted = {path.split(".")[0] for path in (*paths, panels["Indicator!localized"]["path"])}
     assert plotted == {"/hmt/pmf", "/hmt/entropy", "/hmt/is_localized"}
-    told = {panels["DiagnosticSummary!nodes"]["topicToRender"], plan["publish"]["poseEstimateTopic"]}
-    assert plotted | set(plan["topics"]) | told <= topics_of_the_nodes()
+    reported = {panels["DiagnosticSummary!nodes"]["topicToRender"], plan["publish"]["poseEstimateTopic"]}
+    assert plotted | set(plan["topics"]) | reported <= topics_of_the_nodes()

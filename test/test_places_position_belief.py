@@ -136,11 +136,11 @@ def test_the_belief_is_that_of_an_enumeration_of_all_paths(seed):
         else:
             belief = belief.predict_travel(places.spacing)
         belief = belief.update(graph_seen, MODEL, away, variance)
-        told = np.append(
+        reported = np.append(
             log_observation_ratios(graph_seen, graph.expected_landmarks, away, variance, MODEL),
             log_unknown_ground_ratio(graph_seen, MODEL),
         )
-        factors.append(transition(graph, places, action) * np.exp(told))
+        factors.append(transition(graph, places, action) * np.exp(reported))
     start = np.exp(uniform_belief(graph, places).log_probabilities)
     ends = np.zeros(graph.state_count + 1)
     for path in itertools.product(range(graph.state_count + 1), repeat=3):

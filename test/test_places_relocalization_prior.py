@@ -86,7 +86,9 @@ def test_a_look_finds_the_landmarks_gathered_at_the_events_before(drive, monkeyp
     prior, found = place_prior(scans), (located(se2.compose(true, np.array([2.0, 0.0, 0.0]))),)
     where, sighting = PoseDistribution(found, np.array([0.8])), GrowingArea.observe_keyframe
     looked_at = []
-    monkeypatch.setattr(GrowingArea, "observe_keyframe", lambda *asked: looked_at.append(asked) or sighting(*asked))
+    monkeypatch.setattr(
+        GrowingArea, "observe_keyframe", lambda *requested: looked_at.append(requested) or sighting(*requested)
+    )
     steps = CONFIGURATION.tsbi.recheck_keyframes - 1
     for _ in range(steps):
         known = len(looked_at)
@@ -102,14 +104,14 @@ def test_where_keyframes_of_the_map_moved_it_is_evaluated_again(drive):
     hybrid_map, scans, seen, before, true = drive
     prior = place_prior(scans)
     place = [located(true)]
-    (asked,) = prior.log_ratios(hybrid_map, seen, before, place)
+    (requested,) = prior.log_ratios(hybrid_map, seen, before, place)
     moved, shift = hybrid_map.branch(), np.array([3.0, -2.0, 0.0])
     for k, pose in hybrid_map.keyframes(0).items():
         moved.set_keyframe(k, 0, se2.compose(shift, pose))
     (off,) = prior.log_ratios(moved, seen, before, place)
     (there,) = prior.log_ratios(moved, seen, before, [located(se2.compose(shift, true))])
-    assert there == pytest.approx(asked, abs=1.0)
-    assert off < asked - 3.0
+    assert there == pytest.approx(requested, abs=1.0)
+    assert off < requested - 3.0
 
 
 def test_new_ground_looks_like_the_places_of_the_map(drive):

@@ -35,8 +35,8 @@ def mapped(walls, poses, beams=721, field_of_view=2 * np.pi):
     for pose in poses:
         scan = scan_in(walls, pose, beams=beams, field_of_view=field_of_view)
         near = np.hypot(*scan.points.T) < 12.0
-        told = MappedBeams(scan.points[near], np.empty((0, 2)), scan.origins[near])
-        pool.insert(table[None], np.array([pose], dtype=float), told, InverseSensorModel(17, -8, 70))
+        reported = MappedBeams(scan.points[near], np.empty((0, 2)), scan.origins[near])
+        pool.insert(table[None], np.array([pose], dtype=float), reported, InverseSensorModel(17, -8, 70))
     return pool, table
 
 

@@ -54,14 +54,14 @@ def belief(mean: np.ndarray) -> PoseGaussian:
     return PoseGaussian(np.asarray(mean, dtype=float), COVARIANCE)
 
 
-def keyframe(sequence: int, leaves: dict[int, int]) -> Keyframe:
+def keyframe(sequence: int, children: dict[int, int]) -> Keyframe:
     """Keyframe event with {hypothesis: area}; poses are exact in each hypothesis."""
     index = EVERY * sequence
     estimates = tuple(
         HypothesisEstimate(
             hypothesis, area, belief(se2.between(frame(area), TRUTH[index])), True, 0.0, 0.0, Clutter(), 12.0
         )
-        for hypothesis, area in leaves.items()
+        for hypothesis, area in children.items()
     )
     return Keyframe(sequence, scan(index), 6.0 * index / (SCANS - 1), estimates)
 
@@ -89,16 +89,16 @@ def trails() -> list[ScanPoses]:
 
 
 def messages() -> list:
-    said = list(trails())
+    sent = list(trails())
     for index in range(SCANS):
         area = 1 if index > EVERY * CUT else 0
         pose = belief(se2.between(frame(area), TRUTH[index]))
-        said.append(LocalEstimate(int(STAMPS[index]), index, area, pose, TRUTH[index], 0))
+        sent.append(LocalEstimate(int(STAMPS[index]), index, area, pose, TRUTH[index], 0))
     for k in range(SCANS // EVERY):
-        said.append(keyframe(k, {0: 0} if k <= CUT else {1: 1, 2: 0} if k <= VERDICT else {1: 1}))
-        said.append(hypotheses(k))
-        said.append(accepted(k))
-    return [*said, Notice("slam", "two scans had no beam: clean the laser"), EndOfRun(SCANS, SCANS, 0)]
+        sent.append(keyframe(k, {0: 0} if k <= CUT else {1: 1, 2: 0} if k <= VERDICT else {1: 1}))
+        sent.append(hypotheses(k))
+        sent.append(accepted(k))
+    return [*sent, Notice("slam", "two scans had no beam: clean the laser"), EndOfRun(SCANS, SCANS, 0)]
 
 
 def hypotheses(k: int) -> Hypotheses:
@@ -142,10 +142,10 @@ FIGURES = RunMetrics(
 
 
 def recorded(order: int = 0, without: type | None = None) -> Recorder:
-    said = [message for message in messages() if without is None or not isinstance(message, without)]
+    sent = [message for message in messages() if without is None or not isinstance(message, without)]
     recorder = Recorder(with_changes(Configuration(), {"seed": 7, "local_map.cell": 0.1}))
-    for index in np.random.default_rng(order).permutation(len(said)) if order else range(len(said)):
-        assert recorder.handle(said[index]) == []
+    for index in np.random.default_rng(order).permutation(len(sent)) if order else range(len(sent)):
+        assert recorder.handle(sent[index]) == []
     return recorder
 
 

@@ -64,19 +64,21 @@ def test_time_that_jumps_back_restarts():
     np.testing.assert_array_equal(correction.smooth(0, near, FAR, 0.5), near)
 
 
-@pytest.mark.parametrize(("before", "said"), [((), "yes"), (ORDINARY, "not permitted")], ids=["permitted", "ordinary"])
-def test_rtl_comes_before_what_computes_for_long_where_that_is_permitted(listener, start, before, said):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+@pytest.mark.parametrize(
+    ("before", "messages"), [((), "yes"), (ORDINARY, "not permitted")], ids=["permitted", "ordinary"]
+)
+def test_rtl_comes_before_what_computes_for_long_where_that_is_permitted(listener, start, before, messages):
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     process = start("rtl", before=before)
 
     def answer():
-        values = [value for message in told for status in message.status for value in status.values]
+        values = [value for message in reported for status in message.status for value in status.values]
         return next((value.value for value in values if value.key == "real-time scheduling"), None)
 
     listener.until(answer, alive=[process])
     if before == () and answer() == "not permitted":
         pytest.skip("the system does not permit it: it needs root or an rtprio limit")
-    assert answer() == said
+    assert answer() == messages
     threads = [int(thread.name) for thread in Path(f"/proc/{process.pid}/task").iterdir()]
     policies = {os.sched_getscheduler(thread) for thread in threads}
-    assert policies == {os.SCHED_RR if said == "yes" else os.SCHED_OTHER}
+    assert policies == {os.SCHED_RR if messages == "yes" else os.SCHED_OTHER}

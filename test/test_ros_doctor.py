@@ -38,9 +38,9 @@ def doctor(listener):
         while process.poll() is None:
             meanwhile()
             listener.executor.spin_once(timeout_sec=0.02)
-        said, error = process.communicate()
+        messages, error = process.communicate()
         assert not error
-        return process.returncode, json.loads(said)["findings"]
+        return process.returncode, json.loads(messages)["findings"]
 
     return examined
 
@@ -56,7 +56,7 @@ def test_a_sound_robot_gets_a_clean_bill(listener, doctor, start):
         "robot__scan_listeners": 0,
         "robot__odometry_listeners": 0,
     }
-    scans = listener.hear(LaserScan, "scan", BEST_EFFORT)
+    scans = listener.subscribe(LaserScan, "scan", BEST_EFFORT)
     robot = start("robot", log=WORLD, **parameters)
     listener.until(lambda: scans, alive=[robot])
     status, findings = doctor(4.0)

@@ -79,10 +79,10 @@ class Driver:
 
 
 def test_rtl_that_is_killed_goes_on_with_the_pose_and_the_parameters_that_it_had(tmp_path, listener, start):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     odom = listener.node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
     estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
-    placed = listener.hear(PoseWithCovarianceStamped, POSE, topics.STREAM)
+    placed = listener.subscribe(PoseWithCovarianceStamped, POSE, topics.STREAM)
     process = start("rtl", recovery=tmp_path)
     listener.until(lambda: odom.get_subscription_count() and estimates.get_subscription_count(), alive=[process])
     belief = PoseGaussian(np.array([1.0, 2.0, 0.0]), 1e-4 * np.eye(3))
@@ -106,9 +106,9 @@ def test_rtl_that_is_killed_goes_on_with_the_pose_and_the_parameters_that_it_had
     kill(process)
     assert list(tmp_path.iterdir())
 
-    said, heard = len(placed), len(told)
+    said, received = len(placed), len(reported)
     process = start("rtl", recovery=tmp_path)
-    listener.until(lambda: len(told) > heard, alive=[process])
+    listener.until(lambda: len(reported) > received, alive=[process])
     assert len(placed) == said  # nothing that is past
     while len(placed) < said + 1:
         drive()
@@ -133,12 +133,12 @@ def test_a_process_that_was_dead_while_the_others_restarted_restarts_too(corrido
     nodes.until(lambda: len(nodes.estimates) == 15)
     nodes.park()
     kill(nodes.alive[1])
-    asked = listener.node.create_client(Trigger, "slam/reset").call_async(Trigger.Request())
+    requested = listener.node.create_client(Trigger, "slam/reset").call_async(Trigger.Request())
     listener.spin(0.5)
-    assert not asked.done()
+    assert not requested.done()
     restart(nodes, "aam", 1, **parameters)
-    nodes.until(asked.done)
-    assert asked.result().success, asked.result().message
+    nodes.until(requested.done)
+    assert requested.result().success, requested.result().message
     nodes.drive(log, first=0, robot__duration=6.0)
     nodes.until(lambda: len(nodes.estimates) == 15 + 30)
     # Of the new map, though slam sent keyframes of the same numbers before the reset.
@@ -271,16 +271,16 @@ def test_a_laser_falls_silent_a_disk_is_full_and_time_jumps_back(listener, start
     FolderReader(tmp_path / "map", FORMAT, VERSION)
     for process in nodes.alive[:5]:
         process.send_signal(signal.SIGINT)
-    told = slam.communicate(timeout=20)[1]
-    assert "scans come again, after" in told
-    assert "time went back by" in told
-    assert "the node goes on, but if it is killed all have to be restarted; make room there" in told
+    reported = slam.communicate(timeout=20)[1]
+    assert "scans come again, after" in reported
+    assert "time went back by" in reported
+    assert "the node goes on, but if it is killed all have to be restarted; make room there" in reported
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
 def test_a_missing_transform_and_clocks_that_are_apart_are_reported_with_the_remedy(listener, start):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
-    keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    keyframes = listener.subscribe(String, KEYFRAMES, topics.CHAIN)
     scans = listener.node.create_publisher(LaserScan, SCAN, topics.SENSOR)
     odom = listener.node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
     static = listener.node.create_publisher(TFMessage, "tf_static", topics.LATCHED)
@@ -297,7 +297,7 @@ def test_a_missing_transform_and_clocks_that_are_apart_are_reported_with_the_rem
             odom.publish(conversions.odometry_message(one, "odom", "base_link"))
 
     def said():
-        return next((m.status[0].message for m in reversed(told) if m.status[0].name == "/slam"), "")
+        return next((m.status[0].message for m in reversed(reported) if m.status[0].name == "/slam"), "")
 
     listener.until(lambda: "no transform" in said(), alive=[process])
     assert said() == (
@@ -328,9 +328,9 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
     two = Nodes(
         start, listener, "-r", "tf:=/tf", "-r", "tf_static:=/tf_static", namespace="/two", recovery=tmp_path, **frames
     )
-    maps = {nodes: nodes.hear(OccupancyGrid, MAP, topics.LATCHED) for nodes in (one, two)}
-    tf = {topic: listener.hear(TFMessage, topic, topics.TF_STATIC) for topic in ("/one/tf_static", "/tf_static")}
-    tf |= {topic: listener.hear(TFMessage, topic, topics.STREAM) for topic in ("/one/tf", "/tf")}
+    maps = {nodes: nodes.subscribe(OccupancyGrid, MAP, topics.LATCHED) for nodes in (one, two)}
+    tf = {topic: listener.subscribe(TFMessage, topic, topics.TF_STATIC) for topic in ("/one/tf_static", "/tf_static")}
+    tf |= {topic: listener.subscribe(TFMessage, topic, topics.STREAM) for topic in ("/one/tf", "/tf")}
     drives = {one: 40, two: 60}
     for nodes, scans in drives.items():
         folder = tmp_path / f"log_{scans}"
@@ -348,8 +348,8 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
         nodes.until(lambda nodes=nodes, scans=scans: nodes.diagnosis("slam")["received Scan"] == str(scans))
         nodes.until(lambda nodes=nodes: maps[nodes])
         # The robot goes on to say that its log has ended.
-        statuses = nodes.hear(String, ROBOT_STATUS, topics.LATCHED)
-        nodes.until(lambda heard=statuses: len(heard) >= 8)
+        statuses = nodes.subscribe(String, ROBOT_STATUS, topics.LATCHED)
+        nodes.until(lambda received=statuses: len(received) >= 8)
         awaited = len(nodes.diagnostics) + 2 * len(NODES)
         nodes.until(lambda nodes=nodes, awaited=awaited: len(nodes.diagnostics) > awaited)
         assert nodes.diagnosis("slam")["sent EndOfRun"] == "1"

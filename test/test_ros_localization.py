@@ -49,17 +49,17 @@ class Nodes:
     def __init__(self, start, listener, *arguments, namespace="", **parameters):
         self.start, self.listener, self.namespace = start, listener, namespace
         self.arguments = (*arguments, *(["-r", f"__ns:={namespace}"] if namespace else []))
-        self.localized = self.hear(Bool, IS_LOCALIZED, topics.LATCHED)
-        self.entropies = self.hear(Float64, ENTROPY, topics.LATCHED)
-        self.estimates = self.hear(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
-        self.notices = self.hear(String, DOCUMENTS[Notice], topics.CHAIN)
-        self.poses = self.hear(PoseWithCovarianceStamped, POSE, topics.STREAM)
-        self.diagnostics = self.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+        self.localized = self.subscribe(Bool, IS_LOCALIZED, topics.LATCHED)
+        self.entropies = self.subscribe(Float64, ENTROPY, topics.LATCHED)
+        self.estimates = self.subscribe(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
+        self.notices = self.subscribe(String, DOCUMENTS[Notice], topics.CHAIN)
+        self.poses = self.subscribe(PoseWithCovarianceStamped, POSE, topics.STREAM)
+        self.diagnostics = self.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
         self.alive = [start(name, *self.arguments, **parameters) for name in NODES]
 
-    def hear(self, kind, topic, profile):
+    def subscribe(self, kind, topic, profile):
         """What comes on a topic of these nodes."""
-        return self.listener.hear(kind, f"{self.namespace}/{topic}", profile)
+        return self.listener.subscribe(kind, f"{self.namespace}/{topic}", profile)
 
     def until(self, condition):
         self.listener.until(condition, alive=self.alive)
@@ -81,8 +81,8 @@ class Nodes:
 
     def diagnosis(self, node):
         """The last status of a node, {name: value}; values are empty while it was silent."""
-        said = (m.status[0] for m in reversed(self.diagnostics) if m.status[0].name == f"{self.namespace}/{node}")
-        return defaultdict(str, {value.key: value.value for status in islice(said, 1) for value in status.values})
+        messages = (m.status[0] for m in reversed(self.diagnostics) if m.status[0].name == f"{self.namespace}/{node}")
+        return defaultdict(str, {value.key: value.value for status in islice(messages, 1) for value in status.values})
 
 
 def assert_true(message, begin):
@@ -136,13 +136,13 @@ def test_a_robot_that_is_kidnapped_while_the_nodes_run_is_recognized_elsewhere(c
     again = listener.call(Trigger, "slam/relocalize", Trigger.Request())
     assert again.success
     nodes.until(lambda: not nodes.is_localized())
-    said = len(nodes.poses)
+    messages = len(nodes.poses)
     # Slowly enough that rtl has the estimate before the last odometry.
     nodes.drive(log, first=0, rate=4.0)
     nodes.until(nodes.is_localized)
     nodes.until(lambda: len(nodes.estimates) == SCANS - 40 + SCANS)
     listener.spin(1.5)
-    assert len(nodes.poses) > said
+    assert len(nodes.poses) > messages
     begin = stamp_from_time(nodes.poses[-1].header.stamp) - (SCANS - 1) * 200_000_000
     assert_true(nodes.poses[-1], begin)
 

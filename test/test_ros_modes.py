@@ -38,7 +38,7 @@ def set_mode(listener, mode):
 
 def stored(keyframes):
     """Whether keyframes were stored under any hypothesis."""
-    return [any(leaf.stored for leaf in head(message).estimates) for message in keyframes]
+    return [any(hypothesis.stored for hypothesis in head(message).estimates) for message in keyframes]
 
 
 def head(message):
@@ -48,7 +48,7 @@ def head(message):
 def test_a_robot_is_recognized_and_tracked_in_a_map_that_is_saved_as_it_was_loaded(corridor, listener, start, tmp_path):
     log, out = corridor
     nodes = Nodes(start, listener, start_from=out, mode="localization", save_to=tmp_path / "saved")
-    keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
+    keyframes = listener.subscribe(String, KEYFRAMES, topics.CHAIN)
     pointing = listener.node.create_publisher(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
     nodes.drive(log, first=20, rate=8.0)
     nodes.until(nodes.is_localized)

@@ -37,8 +37,8 @@ class Nodes:
 
     def __init__(self, start, listener, log, folder, rate, **robot):
         self.listener = listener
-        self.estimates = listener.hear(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
-        self.keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
+        self.estimates = listener.subscribe(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
+        self.keyframes = listener.subscribe(String, KEYFRAMES, topics.CHAIN)
         self.processes = [start(name, save_to=folder) if name == "slam" else start(name) for name in NODES]
         self.robot = start("robot", log=log, robot__rate=rate, **robot)
 
@@ -146,7 +146,7 @@ def test_nodes_show_a_map_of_the_command_line_at_once_and_go_on_from_it(tmp_path
     log, out = corridor_bag(tmp_path, scans=60), tmp_path / "out"
     command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(out), "--duration", "6"]
     subprocess.run(command, check=True, timeout=120)
-    grids = listener.hear(OccupancyGrid, MAP, topics.LATCHED)
+    grids = listener.subscribe(OccupancyGrid, MAP, topics.LATCHED)
     stayed = start_with(start, start_from=out, start_lost=False)
     nodes = Nodes(stayed, listener, log, tmp_path / "hmt_map", 0.0, robot__start=6.001)
     nodes.until(lambda: grids and nodes.estimates and nodes.last.scan_index == 59)

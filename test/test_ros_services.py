@@ -70,7 +70,7 @@ def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corr
     nodes.until(lambda: "tlca.json is truncated or damaged" in nodes.diagnosis("slam")["last error"])
     assert nodes.is_localized()
 
-    grids = listener.hear(OccupancyGrid, MAP, topics.LATCHED)
+    grids = listener.subscribe(OccupancyGrid, MAP, topics.LATCHED)
     answer = load(listener, f"file://{out}")
     assert answer.result == LoadMap.Response.RESULT_SUCCESS
     assert occupied(answer.map) > 2 * occupied(little)
@@ -89,7 +89,7 @@ def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_messages_can_
     log, out = corridor
     recording = Recording(listener, tmp_path / "bag")
     nodes = Nodes(start, listener, start_from=out, start_lost=False, save_to=tmp_path / "saved")
-    keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
+    keyframes = listener.subscribe(String, KEYFRAMES, topics.CHAIN)
     nodes.until(lambda: {m.status[0].name for m in nodes.diagnostics} == {f"/{name}" for name in NODES})
     answer = listener.call(Trigger, "slam/reset", Trigger.Request())
     assert (answer.success, answer.message) == (True, "the map is forgotten, a new one begins")
@@ -119,8 +119,8 @@ def assert_documented(offered):
         package, name, profile = tables[topic]
         assert kind == f"{package}/msg/{name}", topic
         promised = getattr(topics, profile)
-        for told in profiles:
-            assert (told.reliability, told.durability) == (promised.reliability, promised.durability), topic
+        for reported in profiles:
+            assert (reported.reliability, reported.durability) == (promised.reliability, promised.durability), topic
 
 
 def test_while_paused_scans_are_passed_over_and_odometry_is_not(corridor, listener, start):
@@ -134,13 +134,13 @@ def test_while_paused_scans_are_passed_over_and_odometry_is_not(corridor, listen
 
     def stands():
         """What came before is worked off."""
-        said = nodes.diagnosis("slam")
-        return said["waiting scans"] == "0" and int(said["dropped scans"] or 0) >= 10
+        messages = nodes.diagnosis("slam")
+        return messages["waiting scans"] == "0" and int(messages["dropped scans"] or 0) >= 10
 
     nodes.until(stands)
-    said = len(nodes.estimates)
+    messages = len(nodes.estimates)
     listener.spin(1.0)
-    assert len(nodes.estimates) == said
+    assert len(nodes.estimates) == messages
     nodes.until(lambda: nodes.diagnosis("slam").get("paused", "").startswith("yes"))
     assert listener.call(SetBool, "slam/pause", SetBool.Request(data=False)).success
     # The robot, which waited for an acknowledgement, goes on.

@@ -77,10 +77,10 @@ def test_a_laser_is_silent_only_where_the_node_could_receive_it(monkeypatch, loo
     pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
     from hmt_slam_ros.ros.sensor_input import SensorMonitor  # noqa: PLC0415  only where there is ROS
 
-    said = []
+    messages = []
     monkeypatch.setattr(time, "monotonic", lambda: 0.0)
-    watch = SensorMonitor(SimpleNamespace(warn=said.append))
+    watch = SensorMonitor(SimpleNamespace(warn=messages.append))
     for readings, moment in enumerate(looks, 1):
         monkeypatch.setattr(time, "monotonic", lambda moment=moment: moment)
         watch.check_silence(readings)
-    assert bool(said) == silent
+    assert bool(messages) == silent

@@ -79,14 +79,14 @@ def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_o
     log, saved = corridor_bag(tmp_path, scans=SCANS), tmp_path / "hmt_map"
     manager, nodes = Manager(listener), Nodes(start, listener, autostart=False, save_to=saved, save_on_shutdown=True)
 
-    def said(node):
+    def messages(node):
         return nodes.diagnosis(node)["state"]
 
-    nodes.until(lambda: all(said(name) == "unconfigured" for name in NODES))
+    nodes.until(lambda: all(messages(name) == "unconfigured" for name in NODES))
     assert listener.node.count_subscribers(SCAN) == listener.node.count_publishers(KEYFRAMES) == 0
     nodes.drive(log, first=0, rate=4.0, robot__discovery_timeout=120.0)
     manager.lead(UP, "configure", "inactive")
-    nodes.until(lambda: all(said(name) == "inactive" for name in NODES))
+    nodes.until(lambda: all(messages(name) == "inactive" for name in NODES))
     assert listener.node.count_subscribers(SCAN) == 0
     manager.lead(DOWN, "activate", "active")
     listener.until(lambda: nodes.estimates, seconds=150.0, alive=nodes.alive)  # a first run compiles
@@ -118,7 +118,7 @@ def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_o
     manager.lead(DOWN, "deactivate", "inactive")
     assert listener.call(Trigger, "slam/save", Trigger.Request()).success
     FolderReader(saved, FORMAT, VERSION)
-    begun_anew(manager, nodes, log)
+    restarted(manager, nodes, log)
     assert estimates_of(nodes, SCANS) == estimates_of(nodes, 0)[:SCANS]
 
     shutil.rmtree(saved)
@@ -127,7 +127,7 @@ def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_o
         assert manager.state(name) == "finalized"
     nodes.until(lambda: listener.node.count_subscribers("hmt/closure_decisions") == 0)
     FolderReader(saved, FORMAT, VERSION)
-    nodes.until(lambda: all(said(name) == "finalized" for name in NODES))
+    nodes.until(lambda: all(messages(name) == "finalized" for name in NODES))
 
 
 def halt(manager, nodes, name):
@@ -163,7 +163,7 @@ def stands(nodes):
     assert before < SCANS
 
 
-def begun_anew(manager, nodes, log):
+def restarted(manager, nodes, log):
     """Slam alone does not restart, all five do."""
     manager.lead(["slam"], "cleanup", "unconfigured")
     assert not manager.change("slam", "configure")
@@ -193,12 +193,12 @@ def test_a_node_that_cannot_be_configured_says_why_and_stays(listener, start, tm
 
 
 def test_a_node_that_is_killed_comes_back_in_the_state_in_which_it_was(listener, start, tmp_path):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     node = start("rtl", recovery=tmp_path)
     assert Manager(listener).change("rtl", "deactivate")
     node.send_signal(signal.SIGKILL)
     node.communicate()
-    heard = len(told)
+    received = len(reported)
     node = start("rtl", recovery=tmp_path)
-    listener.until(lambda: len(told) > heard, alive=[node])
-    assert told[-1].status[0].message == "inactive"
+    listener.until(lambda: len(reported) > received, alive=[node])
+    assert reported[-1].status[0].message == "inactive"

@@ -74,15 +74,15 @@ def snapshot(port):
 
 
 def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(listener, start, browser, screenshots):
-    maps = listener.hear(OccupancyGrid, MAP, topics.LATCHED)
-    graphs = listener.hear(MarkerArray, GRAPH, topics.LATCHED)
-    particles = listener.hear(PoseArray, PARTICLES, topics.STREAM)
-    poses = listener.hear(PoseWithCovarianceStamped, POSE, ALL)
-    local_poses = listener.hear(PoseWithCovarianceStamped, HMT_POSE, ALL)
-    pmfs = listener.hear(Float64MultiArray, PMF, topics.LATCHED)
-    health = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
-    transforms = listener.hear(TFMessage, "tf", ALL) if TFMessage else None
-    finished = listener.hear(String, FINISHED, topics.CHAIN)
+    maps = listener.subscribe(OccupancyGrid, MAP, topics.LATCHED)
+    graphs = listener.subscribe(MarkerArray, GRAPH, topics.LATCHED)
+    particles = listener.subscribe(PoseArray, PARTICLES, topics.STREAM)
+    poses = listener.subscribe(PoseWithCovarianceStamped, POSE, ALL)
+    local_poses = listener.subscribe(PoseWithCovarianceStamped, HMT_POSE, ALL)
+    pmfs = listener.subscribe(Float64MultiArray, PMF, topics.LATCHED)
+    health = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    transforms = listener.subscribe(TFMessage, "tf", ALL) if TFMessage else None
+    finished = listener.subscribe(String, FINISHED, topics.CHAIN)
     port = free_port()
     nodes = [start("view", port=port)]
     page = Page(browser, listener, nodes)
@@ -150,11 +150,11 @@ def assert_graph(graph):
 
 
 def assert_health(health):
-    told = {status.name.strip("/"): {v.key: v.value for v in status.values} for a in health for status in a.status}
-    assert set(told) == {*PROCESSES, "robot", "view"}
-    assert {"memory", "peak memory", "busy", "last error"} <= set.intersection(*map(set, told.values()))
-    assert float(told["slam"]["effective samples"].removesuffix(" of 12")) >= 1.0
-    assert float(told["slam"]["memory"].removesuffix(" MB")) > 20.0
+    reported = {status.name.strip("/"): {v.key: v.value for v in status.values} for a in health for status in a.status}
+    assert set(reported) == {*PROCESSES, "robot", "view"}
+    assert {"memory", "peak memory", "busy", "last error"} <= set.intersection(*map(set, reported.values()))
+    assert float(reported["slam"]["effective samples"].removesuffix(" of 12")) >= 1.0
+    assert float(reported["slam"]["memory"].removesuffix(" MB")) > 20.0
     values = [value for array in health for status in array.status for value in status.values]
     assert max(float(value.value) for value in values if value.key == "sent Scan a second") > 1.0
 
@@ -173,10 +173,10 @@ def assert_page(page, port, graph, pmf):
     assert drawn["areas"] == groups["areas"]
     assert drawn["arcs"] == groups["arcs"] + groups["closures"]
     assert drawn["closures"] == groups["closures"]
-    leaves = zip(*[iter(pmf.data)] * 3, strict=True)
-    rows = [(hypothesis, area) for hypothesis, area, _ in leaves if hypothesis >= 0]
+    hypotheses = zip(*[iter(pmf.data)] * 3, strict=True)
+    rows = [(hypothesis, area) for hypothesis, area, _ in hypotheses if hypothesis >= 0]
     assert drawn["bars"] == len(rows)
-    assert [tuple(leaf[:2]) for leaf in known["history"]["events"][-1]["hypotheses"]] == rows
+    assert [tuple(child[:2]) for child in known["history"]["events"][-1]["hypotheses"]] == rows
     assert drawn["events"] == len(known["history"]["events"]) > 50
     assert drawn["robot"] == known["robot"]["pose"]
     assert page.text("position").startswith(f"{drawn['robot'][0]:.2f}")

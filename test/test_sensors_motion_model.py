@@ -137,9 +137,9 @@ def test_the_noise_of_odometry_is_learnt(factor):
 def test_odometry_better_than_its_model_is_taken_as_the_model_says():
     np.testing.assert_array_equal(learnt(0.3).factors, 1.0)
     step, inertia = RelativeMotion(TURNING, np.diag([1.0, 2.0, 3.0])), RelativeMotion(np.zeros(3), 1e-6 * np.eye(3))
-    for said in (learnt(0.3).scale(step), learnt(0.3).fuse(step, inertia)):
-        np.testing.assert_array_equal(said.increment, step.increment)
-        np.testing.assert_array_equal(said.covariance, step.covariance)
+    for messages in (learnt(0.3).scale(step), learnt(0.3).fuse(step, inertia)):
+        np.testing.assert_array_equal(messages.increment, step.increment)
+        np.testing.assert_array_equal(messages.covariance, step.covariance)
 
 
 def test_inertia_reduces_noise_beyond_twice_the_models_and_no_more():
@@ -171,13 +171,13 @@ def test_odometry_predicts_where_readings_enclose_both_scans_and_inertia_elsewhe
     model = MotionModel(MotionParameters())
     for k in (0, 1, 2, 6, 7):
         model.odometry.add(Odometry(k * SECOND // 10, np.array([0.05 * k, 0.0, 0.0])))
-    said = [model.predict(k * SECOND // 10).odometry for k in range(10)]
-    assert [step is None for step in said] == [True] + 7 * [False] + 2 * [True]
-    for step in said[1:8]:
+    messages = [model.predict(k * SECOND // 10).odometry for k in range(10)]
+    assert [step is None for step in messages] == [True] + 7 * [False] + 2 * [True]
+    for step in messages[1:8]:
         np.testing.assert_allclose(step.increment, [0.05, 0.0, 0.0], atol=1e-12)
     # Between readings 0.4 s apart the robot may have sped up and braked.
-    assert said[4].covariance[0, 0] > said[1].covariance[0, 0]
-    assert said[7].covariance[0, 0] == pytest.approx(said[1].covariance[0, 0])
+    assert messages[4].covariance[0, 0] > messages[1].covariance[0, 0]
+    assert messages[7].covariance[0, 0] == pytest.approx(messages[1].covariance[0, 0])
 
 
 def test_where_odometry_is_silent_its_pose_is_extrapolated_by_the_match():

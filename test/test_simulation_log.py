@@ -229,9 +229,9 @@ def test_the_map_that_a_run_leaves_can_be_driven_through(tmp_path):
 def test_simulate_writes_bag_and_truth_and_evaluate_takes_either(tmp_path):
     command = [sys.executable, "-m", "hmt_slam_ros.cli.main"]
     words = ["simulate", "ring", "--seed", "3", "--set", "laps=1", "--duration", "20", "--out", tmp_path / "bag"]
-    said = subprocess.run([*command, *words], capture_output=True, text=True, check=True, timeout=120).stdout
-    assert "101 scans, 20.0 s" in said
-    assert "sim:ring,laps=1,seed=3" in said
+    sent = subprocess.run([*command, *words], capture_output=True, text=True, check=True, timeout=120).stdout
+    assert "101 scans, 20.0 s" in sent
+    assert "sim:ring,laps=1,seed=3" in sent
     log = open_log("sim:ring,laps=1,seed=3", duration=20.0)
     truth = read_tum(tmp_path / "bag" / "ground_truth.tum")
     assert np.array_equal(truth.stamps, read_true_poses(log).stamps)

@@ -24,15 +24,15 @@ def hmt_slam(*arguments):
 @pytest.fixture(scope="module")
 def mapped(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "out"
-    said = hmt_slam("map", LOG, "--out", folder)
-    return folder, said
+    messages = hmt_slam("map", LOG, "--out", folder)
+    return folder, messages
 
 
 def test_a_small_loop_is_closed_and_mapped_to_two_centimeters(mapped):
     """Two laps of 45 m: the mean error of relations to the next meters, and to where the robot was a lap before."""
-    folder, said = mapped
-    assert "0 dropped" in said
-    assert "loop closures: 0" not in said
+    folder, messages = mapped
+    assert "0 dropped" in messages
+    assert "loop closures: 0" not in messages
     errors = evaluate_relations(read_tum(folder / "trajectory.tum"), true_relations(read_true_poses(open_log(LOG))))
     assert errors.overall.missed == 0
     assert errors.over_60_s.count > 30

@@ -109,10 +109,10 @@ def test_the_robot_is_made_as_uncertain_in_the_area_as_its_newest_keyframe():
     children = branching.cut(parent, newest[1:]).children
     assert {child.area for child in children} == {0, 2}
     for child in children:
-        carried = child.frame_change.compose(exact)
-        np.testing.assert_allclose(carried.covariance, child.state.covariances[newest[-1]], atol=1e-12)
+        kidnapped = child.frame_change.compose(exact)
+        np.testing.assert_allclose(kidnapped.covariance, child.state.covariances[newest[-1]], atol=1e-12)
         (moved,) = [r.pose for r in child.moved_keyframes if r.keyframe == newest[-1]]
-        np.testing.assert_allclose(carried.mean, moved, atol=1e-9)
+        np.testing.assert_allclose(kidnapped.mean, moved, atol=1e-9)
 
 
 def test_candidates_beyond_the_number_that_is_examined_keep_their_prior_mass():

@@ -23,7 +23,7 @@ def seen(walls, pose, keyframe):
 
 
 @pytest.fixture
-def asked():
+def requested():
     """Keyframes 0 to 11 in two rooms, areas 0 and 1, and 12 to 15 in the first of them."""
     hybrid_map, scans = HybridMap(), {}
     for area, walls in enumerate((ROOM, OTHER)):
@@ -41,9 +41,9 @@ def whole_map(scans):
 
 
 @pytest.fixture
-def laid(asked):
+def laid(requested):
     """Lays the keyframes of ``requested`` into areas of the map."""
-    hybrid_map, poses, scans = asked
+    hybrid_map, poses, scans = requested
     whole = whole_map(scans)
     return lambda areas: whole.match_regions(hybrid_map, poses, 1000, dict.fromkeys(areas, 1.0 / len(areas)))
 
@@ -60,8 +60,8 @@ def test_a_room_is_recognized_from_anywhere_in_it(laid):
     assert abs(se2.between(se2.between(PATH[0], ASKED[0]), best.mode.pose.mean)[2]) < 0.02
 
 
-def test_what_came_after_is_no_part_of_the_map(asked):
-    hybrid_map, poses, scans = asked
+def test_what_came_after_is_no_part_of_the_map(requested):
+    hybrid_map, poses, scans = requested
     whole = whole_map(scans)
     assert whole.match_regions(hybrid_map, poses, 0, {0: 1.0}) == []
     for keyframe, pose in poses.items():
@@ -69,9 +69,9 @@ def test_what_came_after_is_no_part_of_the_map(asked):
     assert {fit.area for fit in whole.match_regions(hybrid_map, poses, 12, {0: 0.5, 2: 0.5})} == {0}
 
 
-def test_a_room_in_which_the_map_has_traces_of_people_is_recognized(asked, laid):
+def test_a_room_in_which_the_map_has_traces_of_people_is_recognized(requested, laid):
     """They stand where the robot sees free space, which is no sign of another place."""
-    hybrid_map, _, scans = asked
+    hybrid_map, _, scans = requested
     crowd = np.concatenate([box(x, y, x + 0.3, y + 0.3) for x in (0.8, 2.2, 4.3) for y in (0.9, 2.0, 3.4)])
     walls = np.concatenate((ROOM, crowd))
     for k, pose in enumerate(PATH):
@@ -82,9 +82,9 @@ def test_a_room_in_which_the_map_has_traces_of_people_is_recognized(asked, laid)
     assert off(best) < 0.1
 
 
-def test_who_walks_through_what_the_robot_sees_speaks_against_no_place(asked, laid):
+def test_who_walks_through_what_the_robot_sees_speaks_against_no_place(requested, laid):
     """Two people stand elsewhere at every keyframe, where the others see through."""
-    _, poses, scans = asked
+    _, poses, scans = requested
     for n, keyframe in enumerate(poses):
         people = [box(x, y, x + 0.4, y + 0.4) for x, y in ((0.6 + 1.1 * n, 0.6), (4.6 - 1.0 * n, 1.2))]
         scans[keyframe] = seen(np.concatenate((ROOM, *people)), ASKED[n], keyframe)
@@ -94,8 +94,8 @@ def test_who_walks_through_what_the_robot_sees_speaks_against_no_place(asked, la
     assert best.agreement.in_free_space <= 1
 
 
-def test_all_areas_are_looked_at_however_many_there_are(asked, laid):
-    hybrid_map, _, scans = asked
+def test_all_areas_are_looked_at_however_many_there_are(requested, laid):
+    hybrid_map, _, scans = requested
     for area in range(2, 24):
         for k, pose in enumerate(PATH):
             keyframe = 100 + 6 * area + k
@@ -104,9 +104,9 @@ def test_all_areas_are_looked_at_however_many_there_are(asked, laid):
     assert max(laid(range(24)), key=lambda fit: fit.mode.log_mass).area == 0
 
 
-def test_walls_tell_where_keyframes_lie(asked, laid):
+def test_walls_tell_where_keyframes_lie(requested, laid):
     """As they were found, no wall is seen through; half a meter aside, the robot would see through some."""
-    hybrid_map, poses, scans = asked
+    hybrid_map, poses, scans = requested
     best = max(laid([0]), key=lambda fit: fit.mode.log_mass)
     found = whole_map(scans).check_walls(hybrid_map, best, poses, 1000)
     assert found.on_surface > 100
@@ -122,8 +122,8 @@ def test_none_but_the_areas_requested_are_looked_at(laid):
     assert {fit.area for fit in laid([0])} == {0}
 
 
-def test_a_fit_is_reported_in_the_frame_of_its_area_wherever_that_lies_in_its_region(asked, laid):
-    hybrid_map, _, scans = asked
+def test_a_fit_is_reported_in_the_frame_of_its_area_wherever_that_lies_in_its_region(requested, laid):
+    hybrid_map, _, scans = requested
     for k, pose in enumerate(PATH):
         scans[30 + k] = seen(ROOM, pose, 30 + k)
         hybrid_map.set_keyframe(30 + k, 2, se2.between(PATH[0], pose))

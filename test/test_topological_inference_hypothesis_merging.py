@@ -36,9 +36,9 @@ def in_next_area(pose):
     return se2.between(STEP, pose)
 
 
-def with_sharp_arc(claim):
-    claim.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
-    return claim
+def with_sharp_arc(placement):
+    placement.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
+    return placement
 
 
 def test_the_same_place_entered_by_one_area_or_by_the_next_is_one_placement():
@@ -61,10 +61,10 @@ def test_known_ground_is_a_placement_of_its_own():
     assert not recognised.is_equivalent(tracked)
 
 
-def with_another_loop(claim, covariance=SHARP):
+def with_another_loop(placement, covariance=SHARP):
     """The same, and the robot's area is placed beside area 2 as well."""
-    claim.hybrid_map.set_arc(claim.area, 2, PoseGaussian(2.0 * STEP, covariance), closure=True)
-    return claim
+    placement.hybrid_map.set_arc(placement.area, 2, PoseGaussian(2.0 * STEP, covariance), closure=True)
+    return placement
 
 
 @pytest.mark.parametrize("covariance", [SHARP, 100.0 * SHARP])
@@ -76,9 +76,9 @@ def test_a_further_loop_is_a_placement_of_its_own(covariance):
 
 def test_a_loop_that_one_hypothesis_closes_by_two_arcs_and_one_by_the_second_is_one_placement():
     direct, around = entered(0, POSE), with_another_loop(entered(0, POSE))
-    for claim in (direct, around):
-        claim.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
-        claim.hybrid_map.set_arc(1, 2, PoseGaussian(STEP, SHARP), closure=False)
+    for placement in (direct, around):
+        placement.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
+        placement.hybrid_map.set_arc(1, 2, PoseGaussian(STEP, SHARP), closure=False)
     assert direct.is_equivalent(around)
     assert around.is_equivalent(direct)
 
@@ -88,8 +88,8 @@ def test_what_a_hypothesis_is_uncertain_of_it_does_not_place():
 
 
 def test_the_heaviest_represents_all_equivalent_ones():
-    claims = [entered(0, POSE), entered(1, POSE), entered(0, POSE + 0.01)]
+    placements = [entered(0, POSE), entered(1, POSE), entered(0, POSE + 0.01)]
     weights = np.log([0.2, 0.3, 0.5])
-    found = merge_equivalent(claims, weights)
+    found = merge_equivalent(placements, weights)
     assert list(found) == [2, 1]
     np.testing.assert_allclose(np.exp(list(found.values())), [0.7, 0.3])

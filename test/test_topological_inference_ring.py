@@ -74,10 +74,10 @@ def test_a_hypothesis_that_branched_has_children_with_new_ids(ring):
     run, _ = ring
     seen = set()
     for answer in run.answers:
-        parents = [leaf.parent for leaf in answer.hypotheses]
-        for leaf in answer.hypotheses:
-            if leaf.id != leaf.parent:
-                assert leaf.id not in seen
-            elif leaf.id == leaf.parent:
-                assert parents.count(leaf.parent) == 1
-        seen |= {leaf.id for leaf in answer.hypotheses}
+        parents = [child.parent for child in answer.hypotheses]
+        for child in answer.hypotheses:
+            if child.id != child.parent:
+                assert child.id not in seen
+            elif child.id == child.parent:
+                assert parents.count(child.parent) == 1
+        seen |= {child.id for child in answer.hypotheses}
