@@ -95,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except HmtSlamError as fault:
         print(f"benchmark: {fault}", file=sys.stderr)
         return FAULT
-    return 0 if all(report.met for report in reports) else UNMET
+    return 0 if all(report.is_met for report in reports) else UNMET
 
 
 def _measure(options: argparse.Namespace) -> list[Report]:

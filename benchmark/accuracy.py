@@ -163,7 +163,7 @@ def _score_walls(report: Report, by_log: dict[MeasuredLog, list[Run]]) -> None:
     )
     for name, seeds in walls.items():
         report.requirements += [
-            Requirement(f"{name}: torn stretches, worst seed", max(len(seed.torn) for seed in seeds), 0),
+            Requirement(f"{name}: torn stretches, worst seed", max(len(seed.torn_stretches) for seed in seeds), 0),
             Requirement(f"{name}: seeds in which nothing is seen twice", [len(s.stretches) for s in seeds].count(0), 0),
         ]
     report.body += [_walls_table(walls, areas, closures), WALLS_POLICY, _CLOSED]
@@ -179,10 +179,12 @@ def _walls_table(walls: dict[str, list[Walls]], areas: dict[str, list[int]], clo
         ("areas", lambda row: _format_range(areas[row[0]])),
         ("loop closures", lambda row: _format_range(closures[row[0]])),
         ("stretches over known ground", lambda row: _format_range([len(seed.stretches) for seed in row[1]])),
-        ("torn", lambda row: _format_range([len(seed.torn) for seed in row[1]])),
+        ("torn", lambda row: _format_range([len(seed.torn_stretches) for seed in row[1]])),
         (
             "where",
-            lambda row: ", ".join(sorted({f"{s.begin:.0f} m" for seed in row[1] for s in seed.torn})) or "nowhere",
+            lambda row: (
+                ", ".join(sorted({f"{s.begin:.0f} m" for seed in row[1] for s in seed.torn_stretches})) or "nowhere"
+            ),
         ),
         ("agreement", lambda row: f"{np.mean([seed.agreement for seed in row[1]]):.3f}"),
     ]

@@ -65,7 +65,7 @@ class Reentry(NamedTuple):
     record: Record
     rivalry: Record
     moments: list[Moment]
-    verdict: Verdict
+    verdict: ReentryVerdict
 
 
 def measure_ambiguity(settings: Settings) -> Report:
@@ -106,7 +106,7 @@ def is_decided(rivalry: Record) -> bool:
 
 def requirements(family: str, found: Sequence[Reentry]) -> list[Requirement]:
     """Requirements on the re-entries of a family."""
-    open_reentries, deciding = undecided(found), requiring_decision(found)
+    open_reentries, deciding = undecided_by_odometry(found), requiring_decision(found)
     alive_count = sum(entry.verdict.both_alive for entry in open_reentries)
     decided_count = sum(entry.verdict.is_decided_correctly for entry in deciding)
     count, total = len(open_reentries), f"of {len(deciding)}"
@@ -128,7 +128,7 @@ def decided_by_odometry(found: Sequence[Reentry]) -> list[Reentry]:
     return [entry for entry in found if is_decided(entry.rivalry)]
 
 
-def undecided(found: Sequence[Reentry]) -> list[Reentry]:
+def undecided_by_odometry(found: Sequence[Reentry]) -> list[Reentry]:
     """The re-entries that odometry alone does not decide."""
     return [entry for entry in found if not is_decided(entry.rivalry)]
 
@@ -145,7 +145,7 @@ def decision_table(found: Sequence[Reentry]) -> str:
         deciding = requiring_decision(own)
         for kind, entries in (
             ("decided by odometry", decided_by_odometry(deciding)),
-            ("not decided by it", undecided(deciding)),
+            ("not decided by it", undecided_by_odometry(deciding)),
         ):
             counts = [
                 sum(judge_reentry(e.moments, _evidence_event(e.rivalry), path).is_decided_correctly for e in entries)
@@ -160,7 +160,7 @@ def reentry_table(found: Sequence[Reentry]) -> str:
     head = ["re-entry in", "path since the last certain pose [m]", "by odometry", "evidence after [m]"]
     head += ["true one at the question", "before the evidence", "either, lowest", "highest", "alive", "sure after [m]"]
     head += [f"true one after {SOON:g} m", "sure"]
-    rows = [_reentry_row(entry) for entry in undecided(found)]
+    rows = [_reentry_row(entry) for entry in undecided_by_odometry(found)]
     for family, own in _by_family(found).items():
         entries = [entry for entry in decided_by_odometry(own) if entry.verdict.has_question]
         least = min((entry.rivalry["by_odometry"] for entry in entries), default=math.nan)
@@ -179,7 +179,7 @@ def _by_family(found: Sequence[Reentry]) -> dict[str, list[Reentry]]:
 
 def _by_odometry(found: Sequence[Reentry]) -> str:
     """A sentence with the number of re-entries that odometry alone leaves undecided."""
-    open_reentries = undecided(found)
+    open_reentries = undecided_by_odometry(found)
     undecided_count = sum(LOW <= entry.rivalry["by_odometry"] <= HIGH for entry in open_reentries)
     return (
         f"Of the {len(open_reentries)} re-entries that odometry does not decide, it alone leaves both places between "
@@ -219,7 +219,7 @@ def _choose_panels(found: Sequence[Reentry]) -> dict[str, Panel]:
     """One re-entry of each family: the first that odometry does not decide, else the first with a question."""
     panels = {}
     for own in _by_family([entry for entry in found if entry.verdict.has_question]).values():
-        entry = (undecided(own) or own)[0]
+        entry = (undecided_by_odometry(own) or own)[0]
         marks = {"in the known place again": entry.rivalry["event"]}
         if entry.rivalry["evidence"] is not None:
             marks["evidence"] = entry.rivalry["evidence"]
@@ -301,7 +301,7 @@ def _classify(before: str, hypothesis: Mapping[str, Any]) -> str:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ReentryVerdict:
     """The verdict on the hypotheses of a re-entry.
 
     :ivar has_question: whether known places together ever have the probability ``LOW``.
@@ -333,7 +333,7 @@ class Verdict:
         return self.waited is not None and self.final > SURE
 
 
-def judge_reentry(moments: Sequence[Moment], evidence: int, soon: float = SOON) -> Verdict:
+def judge_reentry(moments: Sequence[Moment], evidence: int, soon: float = SOON) -> ReentryVerdict:
     """The verdict on the moments of a re-entry.
 
     :param evidence: the keyframe event from which on the places can be separated.
@@ -341,13 +341,13 @@ def judge_reentry(moments: Sequence[Moment], evidence: int, soon: float = SOON) 
     """
     question = next((moment for moment in moments if moment.has_question), None)
     if question is None:
-        return Verdict(False, None, None, None, None, None, 0.0)
+        return ReentryVerdict(False, None, None, None, None, None, 0.0)
     open_moments = [moment for moment in moments if question.event <= moment.event < evidence]
     shares = [moment.probabilities[kind] for moment in open_moments for kind in (RIGHT, WRONG)]
     begin = next((m.traveled for m in moments if m.event >= max(evidence, question.event)), moments[-1].traveled)
     after = [m for m in moments if m.event >= max(evidence, question.event) and m.traveled <= begin + soon]
     sure = next((m.traveled - begin for m in after if m.probabilities[RIGHT] > SURE), None)
-    return Verdict(
+    return ReentryVerdict(
         True,
         min(shares, default=None),
         max(shares, default=None),

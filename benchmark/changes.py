@@ -187,7 +187,7 @@ def visit_twice(world: str, seed: int, size: float = SIZE, rate: float = RATE) -
     logs = [_simulate_visit(world, seed, number, changed=0.5, size=size, rate=rate) for number in (1, 2)]
     first = map_visits(logs[:1], "mapping")
     second = map_visits(logs, "lifelong", first)
-    surfaces = [Surfaces.of(log) for log in logs]
+    surfaces = [Surfaces.at_visit(log) for log in logs]
     frames = [_frame(after.recording, logs[0]) for after in (first, second)]
     images = [after.image for after in (first, second)]
     scores = score_changes(images, frames, surfaces)
@@ -330,7 +330,7 @@ class Surfaces(NamedTuple):
     half_field: float
 
     @classmethod
-    def of(cls, log: SimulatedLog) -> Surfaces:
+    def at_visit(cls, log: SimulatedLog) -> Surfaces:
         """The surfaces of a visit during which nothing is moved."""
         scenario = log.scenario
         poses = log.true_poses(scenario.scan_stamps[::_EVERY])

@@ -34,7 +34,7 @@ _BEARINGS = np.radians(np.arange(-90.0, 91.0))
 _COVERED = 3.841  # chi-square of 95 % in one dimension
 
 
-class Drive(NamedTuple):
+class CorridorDrive(NamedTuple):
     """The estimates of the filter on one drive.
 
     :ivar truths: of the keyframes, x along the corridor, shape (k, 3).
@@ -72,10 +72,10 @@ class Errors(NamedTuple):
         return nees
 
     @property
-    def covered(self) -> NDArray[np.float64]:
+    def coverage(self) -> NDArray[np.float64]:
         """Share of the motions whose interval of 95 % covers the truth, shape (2,)."""
-        covered: NDArray[np.float64] = (self.errors**2 / self.variances < _COVERED).mean(axis=0)
-        return covered
+        coverage: NDArray[np.float64] = (self.errors**2 / self.variances < _COVERED).mean(axis=0)
+        return coverage
 
     @property
     def shortening(self) -> tuple[float, float]:
@@ -84,7 +84,7 @@ class Errors(NamedTuple):
         return float(shorter.mean()), float(shorter.std() / np.sqrt(shorter.size))
 
 
-def drive(seed: int, length: float = _LENGTH) -> Drive:
+def drive(seed: int, length: float = _LENGTH) -> CorridorDrive:
     """Drive along the corridor, weaving a little.
 
     :param length: m.
@@ -109,7 +109,7 @@ def drive(seed: int, length: float = _LENGTH) -> Drive:
     kept = live.filter.keyframes
     covariances = np.array([live.step_covariances[keyframe] for keyframe in kept])
     floor = configuration.tlca.arc_sigma_floor, configuration.tlca.arc_angle_floor
-    return Drive(truths[kept], live.filter.leading_keyframe_poses(), covariances, odometry_errors[kept], floor)
+    return CorridorDrive(truths[kept], live.filter.leading_keyframe_poses(), covariances, odometry_errors[kept], floor)
 
 
 def _make_path(length: float, random: np.random.Generator) -> NDArray[np.float64]:
@@ -140,7 +140,7 @@ def _process_scan(live: LiveHypothesis, motion: MotionModel, number: int, prepar
         motion.observe_keyframe(live.event.motion, live.event.match_information)
 
 
-def errors_of(drives: Sequence[Drive], stride: int) -> Errors:
+def errors_of(drives: Sequence[CorridorDrive], stride: int) -> Errors:
     """Errors of the disjoint motions from one keyframe to the one ``stride`` later."""
     rows = []
     for drive in drives:
@@ -149,7 +149,9 @@ def errors_of(drives: Sequence[Drive], stride: int) -> Errors:
     return Errors(np.array(errors), np.array(variances), np.array(odometry_errors), np.array(lengths))
 
 
-def _motion_error(drive: Drive, first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
+def _motion_error(
+    drive: CorridorDrive, first: int, last: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
     """Error (2,) and variance (2,) of a motion along and across the corridor, error of odometry and true length."""
     sigma, angle = drive.floor
     covariance = np.zeros((3, 3))
@@ -165,7 +167,7 @@ def _motion_error(drive: Drive, first: int, last: int) -> tuple[NDArray[np.float
     return error[:2], np.diag(turn @ covariance @ turn.T)[:2], odometry_error, length
 
 
-def report(drives: Sequence[Drive]) -> str:
+def report(drives: Sequence[CorridorDrive]) -> str:
     """The table of errors."""
     head = ["motion", "number", "shrink [%]", "odometry [m]", "error [m]", "stated [m]", "NEES along", "across"]
     head += ["covered along [%]", "across"]
@@ -175,7 +177,7 @@ def report(drives: Sequence[Drive]) -> str:
         shortening, deviation = found.shortening
         wheels, along = (np.sqrt(np.mean(values**2)) for values in (found.odometry_errors, found.errors[:, 0]))
         figures = [f"{wheels:.3f}", f"{along:.3f}", f"{np.sqrt(found.variances[:, 0].mean()):.3f}"]
-        shares = [f"{100.0 * share:.1f}" for share in found.covered]
+        shares = [f"{100.0 * share:.1f}" for share in found.coverage]
         shrunk = f"{100.0 * shortening:+.2f} ± {100.0 * deviation:.2f}"
         rows.append([name, str(len(found.errors)), shrunk, *figures, *(f"{n:.2f}" for n in found.nees), *shares])
     return table(head, rows)

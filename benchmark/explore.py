@@ -73,7 +73,7 @@ class Exploration(NamedTuple):
     chart: ChartScores
 
 
-class Mission(NamedTuple):
+class RoomMission(NamedTuple):
     """The scores of a mission.
 
     :ivar success: whether the robot is at its goal, and reports it.
@@ -95,7 +95,7 @@ def measure_explore(settings: Settings) -> Report:
     seeds = chosen_seeds(settings, SEEDS)
     configuration = load_configuration(PARAMETERS, list(settings.changes))
     explorations: list[Exploration] = []
-    missions: dict[str, list[Mission]] = {}
+    missions: dict[str, list[RoomMission]] = {}
     for seed in seeds:
         run = DrivenRun(DrivenRobot(scenario_of(seed)), configuration, Explorer(configuration))
         explorations.append(_explore(run, configuration))
@@ -141,24 +141,24 @@ def is_within(room: Float64, path: Float64) -> bool:
     return bool(np.any((np.abs(local[:, 0]) < 0.5 * room[3]) & (np.abs(local[:, 1]) < 0.5 * room[4])))
 
 
-def _drive_missions(run: DrivenRun[Explorer], seed: int) -> list[Mission]:
+def _drive_missions(run: DrivenRun[Explorer], seed: int) -> list[RoomMission]:
     """Drive to random rooms, each different from the one before."""
     draw, robot, begin = np.random.default_rng(seed), run.robot, run.robot.distance_traveled
-    found: list[Mission] = []
+    found: list[RoomMission] = []
     last = ""
     while len(found) < MISSIONS or (robot.distance_traveled - begin < MISSION_DISTANCE and len(found) < _MOST):
         names = [
             name for name in run.driver.exploration_map.named_places() if name.startswith("room ") and name != last
         ]
         if not names:
-            found.append(Mission(False, math.inf, 0.0, 0.0, 0))
+            found.append(RoomMission(False, math.inf, 0.0, 0.0, 0))
             continue
         last = names[int(draw.integers(len(names)))]
         found.append(_drive_mission(run, last))
     return found
 
 
-def _drive_mission(run: DrivenRun[Explorer], name: str) -> Mission:
+def _drive_mission(run: DrivenRun[Explorer], name: str) -> RoomMission:
     """Drive to a named place."""
     robot, place = run.robot, true_place(run, name)
     distance, begin, contacts = robot.distance_traveled, robot.stamp, robot.contacts
@@ -166,10 +166,10 @@ def _drive_mission(run: DrivenRun[Explorer], name: str) -> Mission:
     off = float(np.hypot(*(robot.pose - place)[:2]))
     success = outcome is not None and outcome.succeeded and off <= _OFF
     seconds = (robot.stamp - begin) / NANOSECONDS
-    return Mission(success, off, robot.distance_traveled - distance, seconds, robot.contacts - contacts)
+    return RoomMission(success, off, robot.distance_traveled - distance, seconds, robot.contacts - contacts)
 
 
-def _requirements(explorations: Sequence[Exploration], missions: Sequence[Mission]) -> list[Requirement]:
+def _requirements(explorations: Sequence[Exploration], missions: Sequence[RoomMission]) -> list[Requirement]:
     charts = [exploration.chart for exploration in explorations]
     states, rooms = sum(chart.states for chart in charts), sum(exploration.rooms for exploration in explorations)
     contacts = sum(drive.contacts for drive in explorations) + sum(mission.contacts for mission in missions)
@@ -209,7 +209,7 @@ _EXPLORATION_COLUMNS: Columns[tuple[int, Exploration]] = [
 ]
 
 
-_MISSION_COLUMNS: Columns[tuple[str, Sequence[Mission]]] = [
+_MISSION_COLUMNS: Columns[tuple[str, Sequence[RoomMission]]] = [
     ("missions", lambda row: row[0]),
     ("number", lambda row: str(len(row[1]))),
     ("success", lambda row: str(sum(mission.success for mission in row[1]))),

@@ -32,7 +32,7 @@ _ON = 1e-6  # m
 _COS, _SIN = math.cos(0.1234), math.sin(0.1234)
 
 
-class Truth(NamedTuple):
+class TrueLandmarks(NamedTuple):
     """Landmarks in the robot's frame.
 
     :ivar poses: shape (n, 3), as of `Corners` or `Openings`, m and rad.
@@ -45,10 +45,10 @@ class Truth(NamedTuple):
     due: NDArray[np.bool_]
 
 
-_NOTHING = Truth(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.bool_))
+_NOTHING = TrueLandmarks(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.bool_))
 
 
-class World:
+class Surroundings:
     """Walls, panels of closed doors and furniture around the robot, in its frame."""
 
     def __init__(self, scenario: Scenario, stamp: int, pose: Array) -> None:
@@ -65,12 +65,12 @@ class World:
         visible: NDArray[np.bool_] = has_line_of_sight(self.index, np.zeros_like(flat), flat)
         return visible.reshape(points.shape[:-1])
 
-    def corners(self, features: FeatureParameters) -> Truth:
+    def corners(self, features: FeatureParameters) -> TrueLandmarks:
         """All corners of surfaces at right angles, on the sides that face the robot."""
         parts = [self._corners_of(sign_a, sign_b, features) for sign_a in (1.0, -1.0) for sign_b in (1.0, -1.0)]
         return _concatenate(parts)
 
-    def _corners_of(self, sign_a: float, sign_b: float, features: FeatureParameters) -> Truth:
+    def _corners_of(self, sign_a: float, sign_b: float, features: FeatureParameters) -> TrueLandmarks:
         walls = self.surfaces
         i, k = np.triu_indices(len(walls), 1)
         a, b = walls[i], walls[k]
@@ -95,7 +95,7 @@ class World:
                 due &= self._is_shown(at, along, side * other, features.min_length)
             heading = np.arctan2(bisector[:, 1], bisector[:, 0])
             poses = np.column_stack((at, heading))
-            found.append(Truth(poses[visible], np.full(visible.sum(), float(side < 0.0)), due[visible]))
+            found.append(TrueLandmarks(poses[visible], np.full(visible.sum(), float(side < 0.0)), due[visible]))
         return _concatenate(found)
 
     def _is_shown(self, at: Array, along: Array, beside: Array, length: float) -> NDArray[np.bool_]:
@@ -105,7 +105,7 @@ class World:
         bearing = np.arctan2(points[..., 1], points[..., 0])
         return self.is_visible(points).all(axis=1) & (np.abs(se2.wrap(bearing[:, -1] - bearing[:, 0])) >= _WIDE)
 
-    def openings(self, features: FeatureParameters) -> Truth:
+    def openings(self, features: FeatureParameters) -> TrueLandmarks:
         """All deep gaps between the end of a wall and the next surface on its line, without furniture."""
         lengths = np.hypot(*(self.building[:, 2:] - self.building[:, :2]).T)
         walls = self.building[lengths >= features.min_length]
@@ -114,7 +114,7 @@ class World:
         gaps = [gap for end, unit in zip(ends, units, strict=True) if (gap := self._gap(end, unit, features))]
         return _without_repetitions(_concatenate([_NOTHING, *gaps]))
 
-    def _gap(self, end: Array, along: Array, features: FeatureParameters) -> Truth | None:
+    def _gap(self, end: Array, along: Array, features: FeatureParameters) -> TrueLandmarks | None:
         """The opening that begins at the end of a wall, None without one."""
         normal = np.array([-along[1], along[0]]) * (1.0 if along[0] * end[1] - along[1] * end[0] > 0.0 else -1.0)
         width, wall = self._next_on_line(end, along, normal)
@@ -135,7 +135,7 @@ class World:
         jambs = end + np.array([-_JAMB, width + _JAMB])[: 1 + wall, None] * along - beside
         due = through.mean() >= _CLEAR and self.is_visible(jambs).all() and np.hypot(*middle) <= REACH
         pose = np.array([[*middle, math.atan2(normal[1], normal[0])]])
-        return Truth(pose, np.array([width]), np.array([due]))
+        return TrueLandmarks(pose, np.array([width]), np.array([due]))
 
     def _next_on_line(self, end: Array, along: Array, normal: Array) -> tuple[float, bool]:
         """Distance from the end of a wall to the next surface on its line, m, and whether that is a wall."""
@@ -188,21 +188,21 @@ def _arm_lengths(at: Array, walls: Array, along: Array, gap: float) -> Array:
     return np.where(ends.min(axis=1) <= gap, ends.max(axis=1), 0.0)
 
 
-def _concatenate(parts: list[Truth]) -> Truth:
-    return Truth(
+def _concatenate(parts: list[TrueLandmarks]) -> TrueLandmarks:
+    return TrueLandmarks(
         np.concatenate([part.poses for part in parts]),
         np.concatenate([part.kinds for part in parts]),
         np.concatenate([part.due for part in parts]),
     )
 
 
-def _without_repetitions(truth: Truth) -> Truth:
+def _without_repetitions(truth: TrueLandmarks) -> TrueLandmarks:
     """Each opening once, due ones first."""
     kept: list[int] = []
     for k in np.argsort(~truth.due, kind="stable").tolist():
         if not np.any(are_near(truth.poses[kept], truth.poses[k], 0.1, 0.1)):
             kept.append(k)
-    return Truth(truth.poses[kept], truth.kinds[kept], truth.due[kept])
+    return TrueLandmarks(truth.poses[kept], truth.kinds[kept], truth.due[kept])
 
 
 def are_near(poses: Array, pose: Array, distance: float, turn: float) -> NDArray[np.bool_]:

@@ -114,7 +114,7 @@ def _wall_index() -> WallIndex:
     return wall_index(np.concatenate([block + shift for shift in shifts]))
 
 
-class Stop(NamedTuple):
+class LatticeStop(NamedTuple):
     """A keyframe on a path along some crossings.
 
     :ivar pose: ``lattice_T_base``, shape (3,).
@@ -127,10 +127,12 @@ class Stop(NamedTuple):
     last: bool
 
 
-def make_stops(crossings: Sequence[tuple[int, int]]) -> Iterator[Stop]:
+def make_stops(crossings: Sequence[tuple[int, int]]) -> Iterator[LatticeStop]:
     """The stops on the path from the center of the first crossing (column, row) through the next ones."""
     for (column, row), (next_column, next_row) in pairwise(crossings):
         quarter = round(math.atan2(next_row - row, next_column - column) / (0.5 * math.pi)) % 4
         for offset in OFFSETS:
             center = np.array([SPACING * next_column, SPACING * next_row, 0.0])
-            yield Stop(center + _pose_in_crossing(offset, quarter), shared_scan(offset, quarter), offset == OFFSETS[-1])
+            yield LatticeStop(
+                center + _pose_in_crossing(offset, quarter), shared_scan(offset, quarter), offset == OFFSETS[-1]
+            )

@@ -103,7 +103,7 @@ REGIMES = (
 )
 
 
-class Stop(NamedTuple):
+class KeyframeStop(NamedTuple):
     """A keyframe event of a drive.
 
     :ivar step: the motion since the last one as the odometry has it, shape (3,).
@@ -116,7 +116,7 @@ class Stop(NamedTuple):
     cut: int
 
 
-class Drive(NamedTuple):
+class ComparedDrive(NamedTuple):
     """The scores of one drive.
 
     :ivar regime: name of the regime.
@@ -159,7 +159,7 @@ def measure_oracle(settings: Settings) -> Report:
     return report
 
 
-def drive_stops(world: str, seed: int, noise: float) -> list[Stop]:
+def drive_stops(world: str, seed: int, noise: float) -> list[KeyframeStop]:
     """A drive along the whole route of a simulated world.
 
     :param noise: factor on the deviations of the odometry.
@@ -172,7 +172,7 @@ def drive_stops(world: str, seed: int, noise: float) -> list[Stop]:
     errors = se2.exp(noise * random.multivariate_normal(np.zeros(3), STEP, size=len(at)))
     steps = [np.zeros(3), *(se2.between(poses[a], poses[b]) for a, b in pairwise(at))]
     return [
-        Stop(
+        KeyframeStop(
             se2.compose(step, error) if k else step,
             log.scenario.scan(int(at[k])),
             _KEYFRAMES if k >= _KEYFRAMES and k % _KEYFRAMES == _KEYFRAMES - 1 else 0,
@@ -181,7 +181,7 @@ def drive_stops(world: str, seed: int, noise: float) -> list[Stop]:
     ]
 
 
-def compare_drive(regime: Regime, world: str, seed: int, noise: float, changes: Sequence[str]) -> Drive:
+def compare_drive(regime: Regime, world: str, seed: int, noise: float, changes: Sequence[str]) -> ComparedDrive:
     """Enumerate a drive, and run TSBI on it with every number of hypotheses.
 
     :param changes: parameters that differ from the file, beside those of the regime.
@@ -202,14 +202,14 @@ def compare_drive(regime: Regime, world: str, seed: int, noise: float, changes: 
         distances[hypotheses] = [
             total_variation(p, q) for p, q, is_counted in zip(exact, pmfs, counts, strict=True) if is_counted
         ]
-    return Drive(regime.name, world, distances, most_topologies, enumeration.dropped)
+    return ComparedDrive(regime.name, world, distances, most_topologies, enumeration.dropped)
 
 
 def _configuration(changes: Sequence[str]) -> Configuration:
     return load_configuration(PARAMETERS, ["tsbi.recheck_keyframes=1000", *changes])
 
 
-def run_tsbi(drive: Sequence[Stop], configuration: Configuration, noise: float) -> list[dict[Visits, float]]:
+def run_tsbi(drive: Sequence[KeyframeStop], configuration: Configuration, noise: float) -> list[dict[Visits, float]]:
     """TSBI's PMF after every cut, without unexamined and dropped probability."""
     script = Script(Tsbi(configuration), noise=noise)
     paths: dict[int, tuple[Visits, dict[int, int]]] = {FIRST_HYPOTHESIS: ((0,), {0: 0})}
@@ -236,7 +236,7 @@ def total_variation(exact: Mapping[Visits, float], found: Mapping[Visits, float]
     return 0.5 * (lacking + sum(abs(exact.get(path, 0.0) - found.get(path, 0.0)) for path in {**exact, **found}))
 
 
-def mean_distances(drives: Sequence[Drive]) -> dict[int, float]:
+def mean_distances(drives: Sequence[ComparedDrive]) -> dict[int, float]:
     """{number of hypotheses: mean distance over all cuts that count}, NaN if there are none."""
     pooled = {n: [distance for drive in drives for distance in drive.distances[n]] for n in HYPOTHESES}
     return {n: float(np.mean(own)) if own else float("nan") for n, own in pooled.items()}
@@ -254,7 +254,7 @@ def oracle_requirements(regime: str, means: Mapping[int, float], usual: int) -> 
     ]
 
 
-def _table_row(regime: str, world: str, drives: Sequence[Drive]) -> list[str]:
+def _table_row(regime: str, world: str, drives: Sequence[ComparedDrive]) -> list[str]:
     cuts = sum(len(drive.distances[HYPOTHESES[0]]) for drive in drives)
     most = max(drive.topologies for drive in drives)
     means = [f"{mean:.4f}" for mean in mean_distances(drives).values()]

@@ -95,7 +95,7 @@ class TaskScore(NamedTuple):
     starts: list[tuple[float, float]]
 
     @property
-    def reached(self) -> bool:
+    def is_reached(self) -> bool:
         """Whether the pilot reports arrival, and the robot is at the place."""
         return self.run.text.endswith(": the robot is there") and self.error <= AT_PLACE
 
@@ -142,7 +142,7 @@ def run_tasks(building: ExploredBuilding) -> list[TaskScore]:
     world = f"sim:institute,seed={building.seed},visit=1,changed=0,laps=1,people={PEOPLE},{LASER}"
     scored: list[TaskScore] = []
     with ExitStack() as stack:
-        start = Start(world, _draw_start(world, draw), building.folder)
+        start = InitialSetup(world, _draw_start(world, draw), building.folder)
         session = PilotSession(stack, stack.enter_context(Listener()), start)
         last = ""
         for _ in range(PER_BUILDING):
@@ -179,7 +179,7 @@ def requirements(scores: Sequence[TaskScore]) -> list[Requirement]:
     starts = [off for score in scores for off, _ in score.starts]
     speed = mean_speed([score.run.distance for score in scores], [score.run.seconds for score in scores])
     return [
-        Requirement("tasks that reach their place", mean([score.reached for score in scores]), 1.0, least=1.0),
+        Requirement("tasks that reach their place", mean([score.is_reached for score in scores]), 1.0, least=1.0),
         Requirement("contacts", float(sum(score.run.contacts for score in scores)), 0.0),
         Requirement("mean speed", speed, math.inf, "m/s", least=_SPEED),
         *([Requirement("initialpose: largest error", max(starts), _START, "m")] if starts else []),
@@ -199,7 +199,7 @@ _COLUMNS: Columns[TaskScore] = [
 ]
 
 
-class Start(NamedTuple):
+class InitialSetup(NamedTuple):
     """The initial state of the nodes.
 
     :ivar world: ``sim:WORLD,...``.
@@ -237,7 +237,7 @@ class TaskRun(NamedTuple):
 class PilotSession:
     """The running nodes with a robot, and their messages."""
 
-    def __init__(self, stack: ExitStack, listener: Listener, start: Start) -> None:
+    def __init__(self, stack: ExitStack, listener: Listener, start: InitialSetup) -> None:
         """Start the nodes, which end with the stack."""
         self._listener = listener
         self._results: list[str] = []

@@ -56,14 +56,14 @@ class Requirement:
     least: float = -math.inf
 
     @property
-    def met(self) -> bool:
+    def is_met(self) -> bool:
         """Whether the figure is within its bounds."""
         return self.least <= self.value <= self.bound
 
     @property
     def row(self) -> list[str]:
         """The cells of its line in the table."""
-        return [self.name, _format_number(self.value, self.unit), self._bounds, "pass" if self.met else "FAIL"]
+        return [self.name, _format_number(self.value, self.unit), self._bounds, "pass" if self.is_met else "FAIL"]
 
     @property
     def _bounds(self) -> str:
@@ -97,9 +97,9 @@ class Report:
     illustrations: tuple[str, ...] = ()
 
     @property
-    def met(self) -> bool:
+    def is_met(self) -> bool:
         """Whether all requirements are met."""
-        return all(requirement.met for requirement in self.requirements)
+        return all(requirement.is_met for requirement in self.requirements)
 
     @property
     def text(self) -> str:
@@ -121,7 +121,7 @@ class Report:
         content = {
             "kind": self.kind,
             "circumstances": dict(describe_circumstances),
-            "requirements": [vars(requirement) | {"met": requirement.met} for requirement in self.requirements],
+            "requirements": [vars(requirement) | {"met": requirement.is_met} for requirement in self.requirements],
             **self.data,
         }
         text = json.dumps(_make_json_safe(content), indent=1, allow_nan=False)

@@ -37,7 +37,7 @@ POLICY = (
 
 
 @dataclass(frozen=True)
-class Verdict:
+class TopologyVerdict:
     """The verdict on the topology of a run.
 
     :ivar scores: of the final trajectory; None for a run that failed.
@@ -84,12 +84,12 @@ def measure_robustness(settings: Settings) -> Report:
     return report
 
 
-def judge_run(run: Run, reference: Run) -> Verdict:
+def judge_run(run: Run, reference: Run) -> TopologyVerdict:
     """The verdict on a run by the truth, and by the run with the recorded odometry."""
     if run.fault:
-        return Verdict(None)
+        return TopologyVerdict(None)
     closures = closure_errors(read_saved_map(run.folder / "hmt_map"), _true_poses(reference))
-    return Verdict(score(run.folder, run.case.log), tuple(closures))
+    return TopologyVerdict(score(run.folder, run.case.log), tuple(closures))
 
 
 def _true_poses(reference: Run) -> dict[int, NDArray[np.float64]]:
@@ -99,7 +99,7 @@ def _true_poses(reference: Run) -> dict[int, NDArray[np.float64]]:
     return {scan.stamp: pose for scan, pose in zip(log.scans[: len(poses)], poses, strict=True)}
 
 
-def _verdict_cells(runs: Sequence[Run], verdicts: Sequence[Verdict]) -> list[str]:
+def _verdict_cells(runs: Sequence[Run], verdicts: Sequence[TopologyVerdict]) -> list[str]:
     scores = [verdict.scores for verdict in verdicts if verdict.scores is not None]
     right = f"{sum(verdict.is_right for verdict in verdicts)} of {len(verdicts)}"
     if not scores:

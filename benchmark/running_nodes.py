@@ -89,14 +89,14 @@ class Listener:
             process.wait(_TIMEOUT)
 
 
-class Start(NamedTuple):
+class StartTime(NamedTuple):
     """The duration of a start: wall time and CPU time, s."""
 
     wall: float
     cpu: float
 
 
-def time_until_answer(name: str) -> Start:
+def time_until_answer(name: str) -> StartTime:
     """Time from the start of a node's process until it answers a service call."""
     with Listener() as listener, open_logs([BUNDLED]) as (log,):
         client = listener.node.create_client(ListParameters, f"{name}/list_parameters")
@@ -105,10 +105,10 @@ def time_until_answer(name: str) -> Start:
             listener.wait_until(client.service_is_ready)
             answer = client.call_async(ListParameters.Request())
             listener.wait_until(answer.done)
-            return Start(time.monotonic() - begin, _cpu_seconds(process))
+            return StartTime(time.monotonic() - begin, _cpu_seconds(process))
 
 
-def time_until_first_pose() -> Start:
+def time_until_first_pose() -> StartTime:
     """Time from the start of metric SLAM to the pose of the first scan, with waiting scans."""
     with Listener() as listener, open_logs([BUNDLED]) as (log,):
         estimates: list[String] = []
@@ -119,7 +119,7 @@ def time_until_first_pose() -> Start:
             begin = time.monotonic()
             with listener.running("slam", {"laser_pose": log.scans[0].laser_pose.tolist()}) as process:
                 listener.wait_until(lambda: bool(estimates))
-                return Start(time.monotonic() - begin, _cpu_seconds(process))
+                return StartTime(time.monotonic() - begin, _cpu_seconds(process))
 
 
 def _waiting_robot(log: Path) -> Parameters:

@@ -224,18 +224,18 @@ class _TimedTsbi:
 
 def measured_cuts(lattice: Lattice, configuration: Configuration, excursions: int = _EXCURSIONS) -> list[Cut]:
     """The cuts of some excursions out of the map, after one that compiles kernels and does not count."""
-    _Robot(Lattice(5, 2), configuration).excursion(0, 0)
+    _ExcursionRobot(Lattice(5, 2), configuration).excursion(0, 0)
     cuts: list[Cut] = []
-    robot = _Robot(lattice, configuration)
+    robot = _ExcursionRobot(lattice, configuration)
     for seed in range(excursions):
         if lattice.areas <= _SMALL:
-            cuts += _Robot(lattice, configuration).excursion(0, seed)
+            cuts += _ExcursionRobot(lattice, configuration).excursion(0, seed)
         else:
             cuts += robot.excursion(seed * (_LONGEST + 2), seed)
     return cuts
 
 
-class _Robot:
+class _ExcursionRobot:
     """A robot that drives out of a lattice and back in."""
 
     def __init__(self, lattice: Lattice, configuration: Configuration) -> None:

@@ -151,7 +151,7 @@ class Stretch:
     shift: float
 
     @property
-    def torn(self) -> bool:
+    def is_torn(self) -> bool:
         """Whether it fits much better elsewhere, or does not fit at all."""
         return self.gain > TORN_GAIN or self.agreement < TORN_AGREEMENT
 
@@ -174,9 +174,9 @@ class Walls:
         return sum(s.returns * s.agreement for s in self.stretches) / returns if returns else float("nan")
 
     @property
-    def torn(self) -> list[Stretch]:
+    def torn_stretches(self) -> list[Stretch]:
         """The stretches that do not fit."""
-        return [stretch for stretch in self.stretches if stretch.torn]
+        return [stretch for stretch in self.stretches if stretch.is_torn]
 
 
 def judge_walls(scans: Sequence[Scan], poses: NDArray[np.float64]) -> Walls:
@@ -217,7 +217,7 @@ class _AgreementGrid:
         self._values: NDArray[np.float64] = np.where(distance < _NEAR, 1.0 - distance / _NEAR, elsewhere)
         self._origin, self._resolution = image.origin, image.resolution
 
-    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def agreement_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Agreement of points (..., 2); 0 where nothing is known."""
         cells = np.floor((points - self._origin) / self._resolution).astype(np.int64)
         size = np.array(self._values.shape[::-1])
@@ -230,14 +230,14 @@ def _score_stretch(
     begin: float, points: NDArray[np.float64], center: NDArray[np.float64], grid: _AgreementGrid
 ) -> Stretch | None:
     """The scored stretch, or None over new ground."""
-    here = grid.at(points)
+    here = grid.agreement_at(points)
     known = int(np.count_nonzero(here))
     if known < _SHARE * len(points) or not known:
         return None
     thinned = points[:: max(1, len(points) // _SEARCHED)]
-    kept = max(int(np.count_nonzero(grid.at(thinned))), 1)
+    kept = max(int(np.count_nonzero(grid.agreement_at(thinned))), 1)
     best, shift = _best_place(thinned, center, grid)
-    gain = max(0.0, best - grid.at(thinned).sum()) / kept
+    gain = max(0.0, best - grid.agreement_at(thinned).sum()) / kept
     return Stretch(begin, known, float(here.sum() / known), float(gain), shift if gain else 0.0)
 
 
@@ -248,7 +248,7 @@ def _best_place(points: NDArray[np.float64], center: NDArray[np.float64], grid: 
     best, distance = -np.inf, 0.0
     for turn in _TURNS:
         turned = se2.transform(np.array([*center, turn]), points - center)
-        sums = grid.at(turned + shifts[:, None]).sum(axis=1)
+        sums = grid.agreement_at(turned + shifts[:, None]).sum(axis=1)
         k = int(np.argmax(sums))
         if sums[k] > best:
             best, distance = float(sums[k]), float(np.hypot(*shifts[k]))

@@ -135,7 +135,7 @@ def _wall_figures(log: MeasuredLog, run: Run) -> dict[str, float]:
     return {
         "disagreement": 1.0 - final.agreement,
         "disagreement_online": 1.0 - online.agreement,
-        "torn_stretches": float(len(final.torn)),
+        "torn_stretches": float(len(final.torn_stretches)),
         "stretches_over_new_ground": float(final.new),
     }
 

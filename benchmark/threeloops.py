@@ -86,7 +86,7 @@ class AcceptedClosure(NamedTuple):
     is_right: bool
 
 
-class Drive(NamedTuple):
+class LoopDrive(NamedTuple):
     """The proposals and closures of a drive.
 
     :ivar traveled: m.
@@ -182,7 +182,7 @@ def measure_threeloops(settings: Settings) -> Report:
     return report
 
 
-def requirements(with_proposals: Sequence[Drive], without: Sequence[Drive]) -> list[Requirement]:
+def requirements(with_proposals: Sequence[LoopDrive], without: Sequence[LoopDrive]) -> list[Requirement]:
     """Requirements on drives with proposals, and on those without."""
     return [
         Requirement("loops closed, share", _closed_share(with_proposals), 1.0, least=1.0),
@@ -191,7 +191,7 @@ def requirements(with_proposals: Sequence[Drive], without: Sequence[Drive]) -> l
     ]
 
 
-def _false_requirements(drives: Sequence[Drive], prefix: str = "") -> list[Requirement]:
+def _false_requirements(drives: Sequence[LoopDrive], prefix: str = "") -> list[Requirement]:
     proposals = sum(not proposal.is_right for drive in drives for proposal in drive.made_proposals)
     closures = sum(not closure.is_right for drive in drives for closure in drive.accepted)
     return [
@@ -200,12 +200,12 @@ def _false_requirements(drives: Sequence[Drive], prefix: str = "") -> list[Requi
     ]
 
 
-def elsewhere_requirements(drives: Sequence[Drive]) -> list[Requirement]:
+def elsewhere_requirements(drives: Sequence[LoopDrive]) -> list[Requirement]:
     """Requirements on drives through other worlds."""
     return _false_requirements(drives, "elsewhere: ")
 
 
-def drive_laps(seed: int, building: str = "", *, changes: tuple[str, ...]) -> Drive:
+def drive_laps(seed: int, building: str = "", *, changes: tuple[str, ...]) -> LoopDrive:
     """Drive laps of one building, by default an institute."""
     configuration = load_configuration(PARAMETERS, [f"tsbi.prior_limit={LIMIT:g}", *changes], seed)
     log = open_simulated(f"sim:{building or f'institute,seed={seed},laps={_LAPS},people={PEOPLE},{LASER}'}")
@@ -213,10 +213,10 @@ def drive_laps(seed: int, building: str = "", *, changes: tuple[str, ...]) -> Dr
     watch.run()
     begins = [loop.begin for loop in watch.loops.found if loop.can_be_closed]
     accepted = [AcceptedClosure(watch.traveled[closure["event"]], closure["right"]) for closure in watch.accepted]
-    return Drive(max(watch.traveled.values()), begins, watch.proposals, accepted)
+    return LoopDrive(max(watch.traveled.values()), begins, watch.proposals, accepted)
 
 
-def _closed_share(drives: Sequence[Drive]) -> float:
+def _closed_share(drives: Sequence[LoopDrive]) -> float:
     """Share of the loops that are closed."""
     return sum(len(own.closing_distances) for own in drives) / max(1, sum(len(own.begins) for own in drives))
 
@@ -225,7 +225,7 @@ def _count_false(closings: Sequence[Proposal] | Sequence[AcceptedClosure]) -> st
     return str(sum(not closing.is_right for closing in closings))
 
 
-_ELSEWHERE_COLUMNS: Columns[tuple[str, Drive]] = [
+_ELSEWHERE_COLUMNS: Columns[tuple[str, LoopDrive]] = [
     ("elsewhere", lambda row: row[0]),
     ("traveled [m]", lambda row: f"{row[1].traveled:.0f}"),
     ("cuts", lambda row: str(len(row[1].proposals))),
@@ -237,7 +237,7 @@ _ELSEWHERE_COLUMNS: Columns[tuple[str, Drive]] = [
 ]
 
 
-def _drive_row(building: str, drive: Drive, without: Drive) -> list[str]:
+def _drive_row(building: str, drive: LoopDrive, without: LoopDrive) -> list[str]:
     before = [p for p in drive.proposals if p.at < min(drive.begins, default=drive.traveled)]
     proposed = sum(proposal.error is not None for proposal in before)
     counts = [len(drive.begins), len(before), proposed, len(drive.proposals) - len(before), len(drive.made_proposals)]

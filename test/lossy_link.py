@@ -36,7 +36,7 @@ def reason_against():
     try:
         with LossyLink(0.0, 0.0, 0.0) as link:
             for number in range(2):
-                subprocess.run([*link.on(number), "true"], check=True, capture_output=True)
+                subprocess.run([*link.host_command(number), "true"], check=True, capture_output=True)
     except subprocess.CalledProcessError as fault:
         return f"two network namespaces are not permitted here: {fault.stderr.decode().strip()}"
     return ""
@@ -76,7 +76,7 @@ class LossyLink:
     def __exit__(self, *_fault):
         self._end.close()
 
-    def on(self, number):
+    def host_command(self, number):
         """The beginning of a command that runs on one of the hosts, of which the second shares this one's memory."""
         apart = ["sh", "-c", 'mount -t tmpfs tmpfs /dev/shm && exec "$@"', "sh"]
         return ["ip", "netns", "exec", self.hosts[number], *([] if number else apart)]

@@ -32,9 +32,9 @@ class Recording:
             if topic not in self._subscriptions and offers:
                 assert not others, topic
                 self.offered[topic] = kind, offers
-                self._subscriptions[topic] = self._subscribed(topic, kind, offers)
+                self._subscriptions[topic] = self._subscribe(topic, kind, offers)
 
-    def _subscribed(self, topic, kind, offers):
+    def _subscribe(self, topic, kind, offers):
         connection = self._writer.add_connection(topic, kind, typestore=typestore())
 
         def keep(content):

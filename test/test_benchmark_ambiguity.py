@@ -10,7 +10,7 @@ from benchmark.ambiguity import (
     RIGHT,
     WRONG,
     Reentry,
-    Verdict,
+    ReentryVerdict,
     decision_table,
     judge_reentry,
     requirements,
@@ -117,12 +117,12 @@ def reentry(by, verdict):
 
 
 def test_requirements_hold_only_where_all_undecided_are_alive_and_all_are_decided_correctly():
-    good = Verdict(True, 0.3, 0.7, 0.5, 0.7, 0.5, 1.0)
-    late = Verdict(True, None, None, None, None, 0.0, 1.0)
-    decided_unasked = reentry(1.0, Verdict(False, None, None, None, None, None, 0.0))
-    assert all(requirement.met for requirement in requirements("twins", [reentry(0.4, good), decided_unasked]))
-    assert [a.met for a in requirements("twins", [reentry(0.4, good), reentry(0.9, late)])] == [True, False, True]
-    assert [requirement.met for requirement in requirements("ring", [reentry(1.0, late)])] == [False, True]
+    good = ReentryVerdict(True, 0.3, 0.7, 0.5, 0.7, 0.5, 1.0)
+    late = ReentryVerdict(True, None, None, None, None, 0.0, 1.0)
+    decided_unasked = reentry(1.0, ReentryVerdict(False, None, None, None, None, None, 0.0))
+    assert all(requirement.is_met for requirement in requirements("twins", [reentry(0.4, good), decided_unasked]))
+    assert [a.is_met for a in requirements("twins", [reentry(0.4, good), reentry(0.9, late)])] == [True, False, True]
+    assert [requirement.is_met for requirement in requirements("ring", [reentry(1.0, late)])] == [False, True]
 
 
 @pytest.fixture(scope="module")

@@ -58,12 +58,12 @@ def test_cells_far_from_all_walls_are_unexplained():
 def test_what_falls_short_is_reported():
     good = Visit(0.9, 0.05, 0.99, 0.0, 0.001, 0.02, 0.08, (100, 120), (5.0, 5.0))
     assert all(
-        requirement.met
+        requirement.is_met
         for requirement in requirements("quiet", [good], [100, 110, 112], [LocalizationVisit(True, 0.03, 0.09)])
     )
     bad = Visit(0.7, 0.2, 0.9, 0.003, 0.01, 0.05, 0.2, (100, 120), (5.0, 5.0))
     assert not any(
-        requirement.met
+        requirement.is_met
         for requirement in requirements("quiet", [bad], [100, 110, 120], [LocalizationVisit(False, 0.2, 0.3)])
     )
 

@@ -32,11 +32,11 @@ def test_what_is_recorded_is_read(tmp_path):
 
 def test_digests_that_differ_are_counted_and_fail():
     other = {"office": {"trajectory": "a1", "map": "b3"}, "continued": {"trajectory": "c3"}}
-    assert [(one.value, one.met) for one in differences(other, DIGESTS)] == [(1, False), (0, True)]
+    assert [(one.value, one.is_met) for one in differences(other, DIGESTS)] == [(1, False), (0, True)]
 
 
 def test_a_run_of_which_nothing_is_recorded_fails():
-    assert not differences({"new": {"map": "b2"}}, DIGESTS)[0].met
+    assert not differences({"new": {"map": "b2"}}, DIGESTS)[0].is_met
 
 
 @pytest.mark.parametrize(

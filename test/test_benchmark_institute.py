@@ -30,7 +30,7 @@ def mission(rights, confident=True):
 
 def test_what_is_required_of_missions():
     good, bad = mission([True] * 10), mission([True] * 8 + [False] * 2)
-    assert all(one.met for one in mission_requirements([good]))
+    assert all(one.is_met for one in mission_requirements([good]))
     values = {one.name: one.value for one in mission_requirements([good, bad])}
     assert values["missions that succeed"] == 0.5
     assert values["false estimates"] == values["confident false estimates"] == pytest.approx(0.1)

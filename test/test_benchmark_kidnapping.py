@@ -41,10 +41,11 @@ def test_a_drive_is_scored_by_the_localization_of_the_robot(states, noticed, aga
 
 def test_a_confident_wrong_answer_and_one_that_comes_late_are_faults():
     met = [
-        one.met for one in requirements("office, known", [summarize(LOST, RIGHT), summarize(LOST, WRONG, WRONG, RIGHT)])
+        one.is_met
+        for one in requirements("office, known", [summarize(LOST, RIGHT), summarize(LOST, WRONG, WRONG, RIGHT)])
     ]
     assert met == [True, False]
-    assert not requirements("office, known", [summarize(*[WRONG] * 7, LOST)])[0].met
+    assert not requirements("office, known", [summarize(*[WRONG] * 7, LOST)])[0].is_met
 
 
 @pytest.mark.parametrize("kind", KINDS)

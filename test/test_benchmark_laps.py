@@ -25,7 +25,7 @@ def laps(last, error=0.03, count=20):
     ],
 )
 def test_what_grows_is_reported(last, error, unmet):
-    failed = [requirement.name for requirement in requirements("office", laps(last, error)) if not requirement.met]
+    failed = [requirement.name for requirement in requirements("office", laps(last, error)) if not requirement.is_met]
     assert failed == ([] if unmet is None else [f"office, lap 3 to 20: growth of {unmet}"])
 
 

@@ -77,11 +77,14 @@ def test_what_is_dropped_is_lacking(drive):
 
 def test_the_distance_has_to_be_small_and_to_fall(monkeypatch):
     monkeypatch.setattr(oracle, "HYPOTHESES", (1, 2))
-    drives = [oracle.Drive("", "", {1: [0.4, 0.2], 2: [0.0]}, 3, 0.0), oracle.Drive("", "", {1: [0.0], 2: []}, 1, 0.0)]
+    drives = [
+        oracle.ComparedDrive("", "", {1: [0.4, 0.2], 2: [0.0]}, 3, 0.0),
+        oracle.ComparedDrive("", "", {1: [0.0], 2: []}, 1, 0.0),
+    ]
     assert mean_distances(drives) == {1: pytest.approx(0.2), 2: 0.0}
-    met = [requirement.met for requirement in oracle_requirements("", {1: 0.2, 16: 0.06, 32: 0.07}, 16)]
+    met = [requirement.is_met for requirement in oracle_requirements("", {1: 0.2, 16: 0.06, 32: 0.07}, 16)]
     assert met == [False, False]
-    assert all(requirement.met for requirement in oracle_requirements("", {1: 0.2, 16: 0.01, 32: 0.0}, 16))
+    assert all(requirement.is_met for requirement in oracle_requirements("", {1: 0.2, 16: 0.01, 32: 0.0}, 16))
 
 
 def test_the_document_has_a_place_for_the_tables():

@@ -25,7 +25,7 @@ def run(end, text="go room 1: the robot is there", offset=(0.0, 0.0, 0.0), conta
 
 def values(*goals):
     scored = [_score_task(BUILDING, task, "room 1") for task in goals]
-    return {task.name: (task.value, task.met) for task in requirements(scored)}
+    return {task.name: (task.value, task.is_met) for task in requirements(scored)}
 
 
 def test_a_task_reaches_its_place_if_the_pilot_reports_it_and_the_robot_is_there():

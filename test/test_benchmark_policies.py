@@ -60,8 +60,8 @@ def test_what_is_near_counts_and_what_is_nowhere_does_not():
 def test_a_policy_is_scored_by_doors_closures_and_the_error_by_ncut():
     good, bad = record([0.2], [0.1], error=0.105), record([2.0], [1.0], wrong=1, error=0.2)
     met = {"both": [good], "other": [bad], "ncut": [record([None], [])]}
-    assert [one.met for one in requirements("both", met)] == [True] * 5
-    assert [one.met for one in requirements("other", met)] == [False, False, False, True, False]
+    assert [one.is_met for one in requirements("both", met)] == [True] * 5
+    assert [one.is_met for one in requirements("other", met)] == [False, False, False, True, False]
 
 
 @pytest.mark.parametrize(("policy", "found"), [("ncut", False), ("both", True)])

@@ -7,7 +7,7 @@ import pytest
 from worlds import box, scan_in
 
 from benchmark.logs import BUNDLED, open_logs
-from benchmark.robustness import Verdict, closure_errors, judge_run
+from benchmark.robustness import TopologyVerdict, closure_errors, judge_run
 from benchmark.runs import Case, Runner
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
@@ -70,19 +70,19 @@ def scores(error):
     return evaluate_relations(trajectory, Relations(stamps[:1], stamps[1:], np.array([[10.0, 0.0, 0.0]])))
 
 
-def moved(x, turn=0.0):
+def errors_of_shift(x, turn=0.0):
     return tuple(errors_of(saved_map(se2.compose(np.array([x, 0.0, turn]), TRUE_ARC))))
 
 
 def test_a_map_of_the_right_topology_is_distinguished_from_wrong_ones():
-    assert Verdict(scores(0.3), moved(0.1)).right
-    assert Verdict(scores(0.3)).right
-    assert not Verdict(scores(1.1), moved(0.1)).right
-    assert not Verdict(scores(0.3), moved(0.6)).right
-    assert not Verdict(scores(0.3), moved(0.0, np.radians(11.0))).right
-    assert not Verdict(scores(0.3), (*moved(0.0), *moved(3.0))).right
-    assert not Verdict(scores(float("nan")), moved(0.0)).right
-    assert not Verdict(None).right
+    assert TopologyVerdict(scores(0.3), errors_of_shift(0.1)).right
+    assert TopologyVerdict(scores(0.3)).right
+    assert not TopologyVerdict(scores(1.1), errors_of_shift(0.1)).right
+    assert not TopologyVerdict(scores(0.3), errors_of_shift(0.6)).right
+    assert not TopologyVerdict(scores(0.3), errors_of_shift(0.0, np.radians(11.0))).right
+    assert not TopologyVerdict(scores(0.3), (*errors_of_shift(0.0), *errors_of_shift(3.0))).right
+    assert not TopologyVerdict(scores(float("nan")), errors_of_shift(0.0)).right
+    assert not TopologyVerdict(None).right
 
 
 def test_runs_with_degraded_odometry_are_scored_and_a_failed_one_is_wrong(tmp_path):
@@ -100,6 +100,6 @@ def test_runs_with_degraded_odometry_are_scored_and_a_failed_one_is_wrong(tmp_pa
         relations.write_text(f"{path.stamps[0] / 1e9} {path.stamps[-1] / 1e9} {last[0]} {last[1]} 0 0 0 {last[2]}\n")
         assert judge_run(reference, reference).scores.overall.translation.max == pytest.approx(0.0, abs=1e-6)
         assert judge_run(degraded, reference).scores.overall.translation.max > 1e-4
-        assert judge_run(failed, reference) == Verdict(None)
+        assert judge_run(failed, reference) == TopologyVerdict(None)
         with pytest.raises(HmtSlamError, match="no such kind"):
             runner.runs([failed.case])

@@ -62,11 +62,11 @@ def test_what_a_stored_area_takes_is_poses_arcs_and_scans():
 
 def test_the_longest_cut_and_the_growth_of_a_scans_cost_are_scored():
     cuts = [Cut(30.0, 0, 1, 0.0), Cut(101.0, 3, 2, 0.0)]
-    assert not cut_requirement(10_000, cuts).met
-    assert cut_requirement(100_000, cuts).met
+    assert not cut_requirement(10_000, cuts).is_met
+    assert cut_requirement(100_000, cuts).is_met
     scans = {10: {"slam": 1.0, "rtl": 1.0}, 1000: {"slam": 1.09, "rtl": 1.2}}
-    assert growth_requirement("slam", scans).met
-    assert not growth_requirement("rtl", scans).met
+    assert growth_requirement("slam", scans).is_met
+    assert not growth_requirement("rtl", scans).is_met
 
 
 @pytest.mark.parametrize("kind", ["scale"])
@@ -87,5 +87,5 @@ def test_a_map_is_saved_and_loaded_with_all_that_was_mapped():
     saved = time_saving(Lattice(4, 3), Configuration())
     assert saved.areas == 12
     assert saved.megabytes > 12 * PER_AREA * 181 * 4 / 1e6
-    assert saved.look > 0.0
+    assert saved.load_map > 0.0
     assert saved.whole == saved.save + saved.load > 0.0

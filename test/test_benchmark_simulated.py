@@ -38,7 +38,7 @@ def drive():
     keyframes = keyframes_of(log)
     truth = Truth(log)
     for keyframe in keyframes:
-        truth.note(keyframe)
+        truth.add_keyframe(keyframe)
     return truth, keyframes
 
 
@@ -66,7 +66,7 @@ def second_lap(truth, keyframes):
 def placement_with_error(truth, known, requirement, error, covariance=TIGHT):
     """The placement that joins the frames of two keyframes, moved by an error."""
     pose = se2.compose(se2.between(truth.poses[known], truth.poses[requirement]), np.array(error))
-    return truth.claim({known: np.zeros(3)}, {requirement: pose}, covariance, pose)
+    return truth.assess({known: np.zeros(3)}, {requirement: pose}, covariance, pose)
 
 
 def test_the_long_world_is_2_km_of_nested_loops_and_no_family():
@@ -106,12 +106,12 @@ def test_a_loop_is_found_where_the_second_lap_begins_and_closed_where_the_map_jo
         area = 0 if keyframe.path_length < 28.0 else 1
         for hybrid_map in (separate, joined):
             hybrid_map.set_keyframe(keyframe.sequence, 2 * area, truth.poses[keyframe.sequence])
-        loops.note(keyframe.sequence, keyframe.path_length, separate, 2 * area)
+        loops.add_event(keyframe.sequence, keyframe.path_length, separate, 2 * area)
         if keyframe.path_length > 60.0 and joined.arc(0, 2) is None:
-            loops.definite(keyframe.sequence, separate, 2)
+            loops.update_definite(keyframe.sequence, separate, 2)
             assert loops.found[-1].closed_at is None
             joined.set_arc(0, 2, PoseGaussian(np.zeros(3), TIGHT), closure=True)
-            loops.definite(keyframe.sequence, joined, 2)
+            loops.update_definite(keyframe.sequence, joined, 2)
     loops.finish()
     (loop,) = loops.found
     assert loop.begin == pytest.approx(54.0, abs=2.0)
@@ -134,7 +134,7 @@ def test_nees_of_draws_from_a_belief_is_that_of_three_degrees_of_freedom():
 def record(tmp_path_factory):
     """A real watched run, in a process of its own."""
     folder = tmp_path_factory.mktemp("records")
-    return folder, Records(folder, 1).of([WORLD], [])[0]
+    return folder, Records(folder, 1).make([WORLD], [])[0]
 
 
 def test_watching_changes_nothing_of_a_run(record):
@@ -165,10 +165,10 @@ def test_a_record_is_made_once_and_again_for_other_parameters(record):
     folder, watched = record
     path = folder / "ring-5.json.gz"
     before = path.stat().st_mtime_ns
-    assert Records(folder, 1).of([WORLD], []) == [watched]
+    assert Records(folder, 1).make([WORLD], []) == [watched]
     assert path.stat().st_mtime_ns == before
     with pytest.raises(HmtSlamError, match=r"ring-5 failed.*no\.such"):
-        Records(folder, 1).of([WORLD], ["no.such=1"])
+        Records(folder, 1).make([WORLD], ["no.such=1"])
     assert read_record(path) == watched
 
 

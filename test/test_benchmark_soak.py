@@ -20,7 +20,7 @@ def test_what_fills_up_in_the_first_half_is_no_growth_and_what_leaks_is():
 
 def test_a_run_that_leaves_something_behind_does_not_do():
     good = Soak(60.0, 600.0, 3000, {"slam": [100] * 100}, statuses={"slam": 0})
-    assert all(one.met for one in requirements(good))
+    assert all(one.is_met for one in requirements(good))
     for fault in (
         {"leaked": {"/dev/shm/fastrtps_1"}},
         {"zombies": 1},
@@ -30,7 +30,7 @@ def test_a_run_that_leaves_something_behind_does_not_do():
         {"driven": 500.0},
         {"resident": {"slam": [100 + k for k in range(100)]}},
     ):
-        assert sum(not one.met for one in requirements(Soak(**{**vars(good), **fault}))) == 1
+        assert sum(not one.is_met for one in requirements(Soak(**{**vars(good), **fault}))) == 1
 
 
 def test_a_run_that_is_too_short_for_that_is_refused(capsys):

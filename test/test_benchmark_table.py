@@ -45,8 +45,8 @@ def test_accuracy_is_equal_up_to_a_factor_or_a_centimeter():
 )
 def test_the_campus_requests_ratios_of_the_last_filter_that_was_tried(last, met):
     found = Comparison(OURS, (method(12, 11.0, 220.0, 1.0), method(*last)), {}, "truth")
-    assert [requirement.met for requirement in requirements(found)] == met
-    assert ("not as accurate" in requirements(found)[1].name) == (not found.equal)
+    assert [requirement.is_met for requirement in requirements(found)] == met
+    assert ("not as accurate" in requirements(found)[1].name) == (not found.is_equal)
     assert comparison_table({"campus": found}).count("metric RBPF") == 2
 
 

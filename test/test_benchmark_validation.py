@@ -70,7 +70,7 @@ def test_the_other_forecasters_see_no_scan():
     assert new_rate([EVENT]) == 0.0
 
 
-def calibrated(count, draw):
+def calibrated_forecasts(count, draw):
     """Questions of two answers whose probabilities are right."""
     for p in draw.uniform(0.5, 1.0, count):
         yield Forecast(p, (1.0 - p,)) if draw.random() < p else Forecast(1.0 - p, (p,))
@@ -78,7 +78,7 @@ def calibrated(count, draw):
 
 def test_right_probabilities_have_no_calibration_error_and_too_certain_ones_have():
     draw = np.random.default_rng(2)
-    right = list(calibrated(20_000, draw))
+    right = list(calibrated_forecasts(20_000, draw))
     assert reliability_of_top(right).error < 0.01
     assert reliability_of_all(right).error < 0.01
     certain = [Forecast(float(each.right > 0.5), (float(each.right <= 0.5),)) for each in right]
@@ -136,8 +136,8 @@ def test_every_run_counts_the_same_for_the_mean_nees():
 
 def test_a_figure_may_be_too_small():
     assert Requirement("NEES", 3.0, 4.5, least=2.0).row[2:] == ["2 to 4.5", "pass"]
-    assert not Requirement("NEES", 1.9, 4.5, least=2.0).met
-    assert not Requirement("NEES", math.nan, 4.5, least=2.0).met
+    assert not Requirement("NEES", 1.9, 4.5, least=2.0).is_met
+    assert not Requirement("NEES", math.nan, 4.5, least=2.0).is_met
     assert Requirement("runs", 8, math.inf, least=300).row[2:] == ["at least 300", "FAIL"]
     assert Requirement("error", 0.1, 1.0, "m").row[2:] == ["1 m", "pass"]
 

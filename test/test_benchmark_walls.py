@@ -28,7 +28,7 @@ def test_a_second_round_that_fits_the_first_is_not_torn(ring):
     scans, poses = ring
     walls = judge_walls(scans, poses)
     assert len(walls.stretches) >= 2
-    assert walls.torn == []
+    assert walls.torn_stretches == []
     assert walls.agreement > 0.8
 
 
@@ -38,14 +38,14 @@ def test_a_second_round_beside_the_first_is_torn(ring, shift):
     second = np.arange(len(poses)) >= ROUND
     moved = np.where(second[:, None], se2.compose(np.array(shift), poses), poses)
     walls = judge_walls(scans, moved)
-    assert walls.torn
+    assert walls.torn_stretches
     assert walls.agreement < 0.6
 
 
 def test_the_way_back_to_where_a_torn_stretch_fits_is_reported(ring):
     scans, poses = ring
     moved = poses + np.where(np.arange(len(poses)) >= ROUND, 0.4, 0.0)[:, None] * [1.0, 0.0, 0.0]
-    (worst, *_) = sorted(judge_walls(scans, moved).torn, key=lambda stretch: -stretch.gain)
+    (worst, *_) = sorted(judge_walls(scans, moved).torn_stretches, key=lambda stretch: -stretch.gain)
     assert worst.shift == pytest.approx(0.4, abs=0.11)
 
 

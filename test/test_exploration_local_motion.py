@@ -127,7 +127,7 @@ def test_it_reaches_goals_in_floors_with_people_without_contact(seed):
     assert len(legs) == 17
     assert all(leg.reached for leg in legs)
     assert sum(leg.contacts for leg in legs) == 0
-    assert sum(leg.metres for leg in legs) > 50.0
+    assert sum(leg.distance for leg in legs) > 50.0
 
 
 @pytest.mark.parametrize("laser", ["360°", "180°"])

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_floor import AREAS, CONFIGURATION, mapped, seen_at
+from small_floor import AREAS, CONFIGURATION, make_map, seen_at
 
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
@@ -26,8 +26,8 @@ NEW_AREA = 7
 
 
 @pytest.fixture(scope="module")
-def saved():
-    hybrid_map, scans = mapped()
+def saved_map():
+    hybrid_map, scans = make_map()
     return Replica(scans, {0: hybrid_map}, {0: 1.0}, {0: 0}).state
 
 
@@ -101,7 +101,7 @@ class Robot:
         return next(message for message in reversed(self.sent) if isinstance(message, PlaceEstimate))
 
 
-def off(place, pose):
+def pose_error(place, pose):
     return se2.between(place.pose.mean, se2.between(AREAS[place.area], pose))
 
 
@@ -110,8 +110,8 @@ def the_room(missions):
     return room
 
 
-def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_until_it_does(saved):
-    missions = PilotProcess(CONFIGURATION, saved)
+def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_until_it_does(saved_map):
+    missions = PilotProcess(CONFIGURATION, saved_map)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="door"), the_room(missions)
     outcome = robot.do("go cellar")
     assert (outcome.succeeded, outcome.text) == (False, f"go cellar: there is no such room: choose from {room}")
@@ -121,7 +121,7 @@ def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_unti
         stood.append(robot.pose)
         robot.step()
     (place,) = robot.starts()
-    assert np.abs(off(place, stood[-1])).max() < 0.05
+    assert np.abs(pose_error(place, stood[-1])).max() < 0.05
     np.testing.assert_allclose(stood[-1], stood[-2], atol=0.02)
     outcome = robot.do(f"go {room}")
     assert (outcome.succeeded, outcome.text) == (True, f"go {room}: the robot is there")
@@ -134,16 +134,16 @@ def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_unti
     assert robot.do(f"go {room}").succeeded
 
 
-def test_metric_slam_that_has_the_robot_at_the_door_gets_no_initial_pose(saved):
-    missions = PilotProcess(CONFIGURATION, saved)
+def test_metric_slam_that_has_the_robot_at_the_door_gets_no_initial_pose(saved_map):
+    missions = PilotProcess(CONFIGURATION, saved_map)
     robot = Robot(missions, (12.0, 0.0, math.pi))
     assert robot.do(f"go {the_room(missions)}").succeeded
     assert not robot.starts()
 
 
 @pytest.mark.parametrize("rtl", ["never", "lost"])
-def test_a_robot_that_metric_slam_does_not_find_behind_the_door_goes_by_the_map_of_the_room(saved, rtl):
-    missions = PilotProcess(CONFIGURATION, saved)
+def test_a_robot_that_metric_slam_does_not_find_behind_the_door_goes_by_the_map_of_the_room(saved_map, rtl):
+    missions = PilotProcess(CONFIGURATION, saved_map)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl), the_room(missions)
     robot.slip = 1.2
     assert robot.do(f"go {room}").succeeded
@@ -154,8 +154,8 @@ def test_a_robot_that_metric_slam_does_not_find_behind_the_door_goes_by_the_map_
     assert math.dist(robot.pose[:2], place[:2]) < 0.2
 
 
-def test_where_metric_slam_has_the_robot_elsewhere_the_belief_restarts_and_no_door_is_entered(saved):
-    missions = PilotProcess(CONFIGURATION, saved)
+def test_where_metric_slam_has_the_robot_elsewhere_the_belief_restarts_and_no_door_is_entered(saved_map):
+    missions = PilotProcess(CONFIGURATION, saved_map)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="elsewhere"), the_room(missions)
     robot.handle_all(parse_task(f"go {room}", PILOT_TASKS))
     confident = []
@@ -171,9 +171,9 @@ def test_where_metric_slam_has_the_robot_elsewhere_the_belief_restarts_and_no_do
     assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
 
 
-def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_once(saved):
+def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_once(saved_map):
     configuration = with_changes(CONFIGURATION, {"pilot.drives": False})
-    missions = PilotProcess(configuration, saved)
+    missions = PilotProcess(configuration, saved_map)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="never"), the_room(missions)
     assert "pilot.drives is false" in robot.do(f"go {room}").text
     robot.sent.clear()
@@ -189,13 +189,13 @@ def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_onc
         at.append(robot.pose)
         if any(isinstance(message, PoseReset) for message in robot.step((0.5, 0.0, 0.0))):
             (place,) = robot.starts()
-            assert np.abs(off(place, at[-1])).max() < 0.1
+            assert np.abs(pose_error(place, at[-1])).max() < 0.1
     assert len(robot.starts()) == 1
     assert not any(isinstance(message, VelocityCommand) for message in robot.sent)
 
 
-def test_it_finds_out_where_it_is_and_stops_on_request_or_when_it_takes_too_long(saved):
-    missions = PilotProcess(with_changes(CONFIGURATION, {"pilot.task_timeout": 2.0}), saved)
+def test_it_finds_out_where_it_is_and_stops_on_request_or_when_it_takes_too_long(saved_map):
+    missions = PilotProcess(with_changes(CONFIGURATION, {"pilot.task_timeout": 2.0}), saved_map)
     robot = Robot(missions, (14.0, 0.0, math.pi), rtl="never")
     assert robot.do("localize").text == "localize: given up after 2 s"
     np.testing.assert_array_equal(robot.velocity, 0.0)
@@ -204,14 +204,14 @@ def test_it_finds_out_where_it_is_and_stops_on_request_or_when_it_takes_too_long
     robot.handle_all(parse_task("stop", PILOT_TASKS))
     np.testing.assert_array_equal(robot.velocity, 0.0)
     assert not any(isinstance(message, VelocityCommand) for message in robot.step())
-    robot = Robot(PilotProcess(CONFIGURATION, saved), (14.0, 0.0, math.pi), rtl="never")
+    robot = Robot(PilotProcess(CONFIGURATION, saved_map), (14.0, 0.0, math.pi), rtl="never")
     outcome = robot.do("localize")
     assert outcome.succeeded
     assert outcome.text.startswith("localize: the robot is at door ")
 
 
-def test_where_time_goes_back_the_robot_may_be_anywhere(saved):
-    missions = PilotProcess(CONFIGURATION, saved)
+def test_where_time_goes_back_the_robot_may_be_anywhere(saved_map):
+    missions = PilotProcess(CONFIGURATION, saved_map)
     robot = Robot(missions, (12.0, 0.0, math.pi), rtl="never")
     assert robot.do("localize").succeeded
     robot.handle_all(parse_task("localize", PILOT_TASKS))
@@ -223,8 +223,8 @@ def test_where_time_goes_back_the_robot_may_be_anywhere(saved):
     assert robot.estimate().place is None
 
 
-def test_one_who_drives_the_robot_out_of_a_room_brings_it_before_the_door(saved):
-    missions = PilotProcess(CONFIGURATION, saved)
+def test_one_who_drives_the_robot_out_of_a_room_brings_it_before_the_door(saved_map):
+    missions = PilotProcess(CONFIGURATION, saved_map)
     robot, room = Robot(missions, (12.0, 0.0, math.pi)), the_room(missions)
     assert robot.do(f"go {room}").succeeded
     for _ in range(20):

@@ -98,7 +98,7 @@ def test_a_loop_is_spread_over_its_arcs_or_left_open_as_requested():
     quarter = np.radians(88.0)
     step = [2.0, 0.0, quarter]
 
-    def around(**changes):
+    def close_ring(**changes):
         play = Play(**changes)
         play.start()
         for area in (1, 2, 3):
@@ -108,10 +108,10 @@ def test_a_loop_is_spread_over_its_arcs_or_left_open_as_requested():
         poses = np.array([poses_of(verdict)[area].mean for area in (0, 1, 2, 3, 0)])
         return play, np.degrees(se2.between(poses[:-1], poses[1:])[:, 2])
 
-    play, turns = around()
+    play, turns = close_ring()
     np.testing.assert_allclose(turns, 90.0, atol=1e-6)
     tree = np.array([play.process.shortest_path_poses()[area].mean for area in (0, 1, 2, 3, 0)])
-    _, turns = around(global_map="shortest_path")
+    _, turns = close_ring(global_map="shortest_path")
     np.testing.assert_allclose(turns, np.degrees(se2.between(tree[:-1], tree[1:])[:, 2]), atol=1e-9)
     assert np.ptp(turns) > 5.0
 

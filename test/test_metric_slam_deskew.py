@@ -64,7 +64,7 @@ class Drive(NamedTuple):
         return float(np.sqrt(np.mean(np.sum(self.errors[:, :2] ** 2, axis=1))))
 
 
-def driven(sweep, reported):
+def drive_sweeping(sweep, reported):
     """A drive with a laser whose sweep takes so many seconds, and says so or not."""
     odometry, dialogue = list(readings()), Dialogue()
     for k in range(SCANS):
@@ -87,9 +87,9 @@ def driven(sweep, reported):
 @pytest.fixture(scope="module")
 def drives():
     return {
-        "standing": driven(0.0, reported=True),
-        "skewed": driven(0.1, reported=False),
-        "deskewed": driven(0.1, reported=True),
+        "standing": drive_sweeping(0.0, reported=True),
+        "skewed": drive_sweeping(0.1, reported=False),
+        "deskewed": drive_sweeping(0.1, reported=True),
     }
 
 

@@ -48,7 +48,7 @@ def test_a_program_without_kernels_does_not_load_numba_for_this(tmp_path):
     assert messages(tmp_path, load="", use="print('numba' in sys.modules)") == ["False"]
 
 
-def reported(*arguments, environment):
+def count_reports(*arguments, environment):
     """How often a command says that it compiles."""
     command = [sys.executable, "-m", "hmt_slam_ros.cli.main", *arguments]
     finished = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=300)
@@ -58,14 +58,14 @@ def reported(*arguments, environment):
 def test_a_command_says_it_once_and_never_again(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     drive = ("simulate", "office", "--duration", "1", "--out")
-    assert [reported(*drive, tmp_path / str(n), environment=environment) for n in range(2)] == [1, 0]
+    assert [count_reports(*drive, tmp_path / str(n), environment=environment) for n in range(2)] == [1, 0]
 
 
 def test_every_kernel_that_maps_a_log_is_in_the_cache_afterwards(tmp_path):
     log, lines = tmp_path / "short.clf", "FLASER 3 1.0 1.1 1.2 {x} 0 0 {x} 0 0 {t} robot {t}\n"
     log.write_text("".join(lines.format(x=0.2 * k, t=float(k)) for k in range(6)))
-    reported("map", log, "--out", tmp_path / "out", environment=os.environ)
-    assert reported("map", log, "--out", tmp_path / "out", environment=os.environ) == 0
+    count_reports("map", log, "--out", tmp_path / "out", environment=os.environ)
+    assert count_reports("map", log, "--out", tmp_path / "out", environment=os.environ) == 0
 
 
 def test_a_node_says_it_once_and_never_again(tmp_path, listener, start, monkeypatch):

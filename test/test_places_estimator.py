@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from small_floor import AREAS, BUILDING, CONFIGURATION, charted, seen_at, walls
+from small_floor import AREAS, BUILDING, CONFIGURATION, make_chart, seen_at, walls
 from worlds import scan_at
 
 from hmt_slam_ros.geometry import se2
@@ -20,7 +20,7 @@ from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covarian
 
 @pytest.fixture(scope="module")
 def chart():
-    return charted()[0]
+    return make_chart()[0]
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ ROUND = 6  # nodes of the loop
 
 def lap(random):
     """The edges of a straight hallway with many landmarks, all of which are extracted in every lap."""
-    ways = [way for way in random_corridors(random, 1, 3, 0.2).ways if way.start_direction == EAST][:ROUND]
+    ways = [way for way in random_corridors(random, 1, 3, 0.2).edges_one_way if way.start_direction == EAST][:ROUND]
     return [way._replace(landmarks=sure(way.landmarks)) for way in ways]
 
 
@@ -38,7 +38,7 @@ def mapped_twice(random, edges, turned=0, missed=0.0):
     nodes = [Node(1.0, empty_sequence(), empty_sequence())] * (2 * ROUND + 1)
     twice = []
     for k in range(2 * ROUND):
-        there = draw_building(random, Corridors([], [edges[k % ROUND]])).ways[0]
+        there = draw_building(random, Corridors([], [edges[k % ROUND]])).edges_one_way[0]
         known = edges[k % ROUND].landmarks
         listed = there.landmarks._replace(
             variances=np.full((len(there.landmarks.tracks), 2), known.variances[0] if len(known.tracks) else 0.0),
@@ -55,7 +55,7 @@ def mapped_twice(random, edges, turned=0, missed=0.0):
     return build_place_graph(nodes, twice, PLACES)
 
 
-def driven(random, belief, detector, edges, start, count):
+def drive_round(random, belief, detector, edges, start, count):
     """Proposals of a robot that goes round in the loop."""
     for k in range(start, start + count):
         own = edges[k % ROUND]
@@ -79,7 +79,7 @@ def test_a_loop_that_was_mapped_twice_is_proposed_with_the_places_that_are_one(t
         edges = lap(random)
         graph = mapped_twice(random, edges, turned, missed)
         belief = initial_loop_belief(graph, PLACES)
-        for loop, _ in driven(random, belief, TwoPeakTracker(), edges, 0, ROUND - 1):
+        for loop, _ in drive_round(random, belief, TwoPeakTracker(), edges, 0, ROUND - 1):
             if loop is not None:
                 found += 1
                 assert abs(loop.node - loop.other_node) == ROUND

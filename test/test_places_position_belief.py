@@ -46,9 +46,12 @@ def random_graph(seed, rows=1, columns=1, density=0.1):
 def test_the_next_opening_is_at_the_end_of_the_edge_or_behind_those_that_are_missed():
     graph = chain([3.0, 4.0, 5.0])
     own = graph.transitions.sources == state_of(0, EAST)
-    seen = 0.5 * PLACES.noticed
+    expected_tracks = 0.5 * PLACES.noticed
     assert list(graph.transitions.targets[own]) == [state_of(k, EAST) for k in (1, 2, 3)]
-    np.testing.assert_allclose(graph.transitions.probabilities[own], [seen, (1 - seen) * seen, (1 - seen) ** 2])
+    np.testing.assert_allclose(
+        graph.transitions.probabilities[own],
+        [expected_tracks, (1 - expected_tracks) * expected_tracks, (1 - expected_tracks) ** 2],
+    )
     np.testing.assert_allclose(graph.transitions.means[own], [(3, 0), (7, 0), (12, 0)])
     np.testing.assert_allclose(graph.transitions.variances[own, 0], [0.04, 0.08, 0.12])
     assert graph.successors[state_of(3, WEST)] == state_of(2, WEST)
@@ -58,17 +61,17 @@ def test_the_next_opening_is_at_the_end_of_the_edge_or_behind_those_that_are_mis
 def test_a_state_sees_ahead_and_back_what_the_map_has_there():
     graph = chain([3.0, 4.0, 5.0], places=dataclasses.replace(PLACES, reach=6.0))
 
-    def seen(state):
+    def expected_tracks(state):
         own = slice(*graph.expected_landmarks.starts[state : state + 2])
         return graph.expected_landmarks.landmarks.tracks[own], graph.expected_landmarks.landmarks.positions[own]
 
-    tracks, along = seen(state_of(1, EAST))
+    tracks, along = expected_tracks(state_of(1, EAST))
     np.testing.assert_allclose(along, [-2.0, 1.1, 5.2])
     assert not tracks.any()
-    tracks, along = seen(state_of(1, WEST))
+    tracks, along = expected_tracks(state_of(1, WEST))
     np.testing.assert_allclose(along, [-5.2, -1.1, 2.0])
     assert (tracks == 1).all()
-    assert not len(seen(state_of(1, NORTH))[0])
+    assert not len(expected_tracks(state_of(1, NORTH))[0])
 
 
 def test_behind_a_bend_nothing_is_in_sight():
@@ -223,7 +226,7 @@ def test_the_traveled_distance_separates_openings():
     assert start.predict_arrival(Travel(6.9, 0.0, (0.01, 0.01))).most_likely_state == state_of(2, EAST)
 
 
-def simulated(seed, places, steps=6):
+def simulate_beliefs(seed, places, steps=6):
     """Beliefs and true states of a robot that moves and sees exactly as the model says."""
     random = np.random.default_rng(seed)
     graph = random_graph(seed % 7, density=0.02)
@@ -272,7 +275,7 @@ def test_beliefs_about_robots_of_the_model_are_calibrated():
     places = dataclasses.replace(PLACES, slip=0.05, discovery=0.2, unmapped=0.2)
     peaks, right = [], []
     for seed in range(250):
-        for belief, state in simulated(seed, places):
+        for belief, state in simulate_beliefs(seed, places):
             peaks.append(belief.probabilities.max())
             right.append(int(np.argmax(belief.log_probabilities)) == state)
     peaks, right = np.array(peaks), np.array(right)

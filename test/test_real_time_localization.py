@@ -27,7 +27,7 @@ def estimate(seconds, pose, odom, area=0, variance=1e-4):
     return LocalEstimate(round(seconds * SECOND), 0, area, belief, np.array(odom, dtype=np.float64), 0)
 
 
-def accepted(**areas):
+def make_decision(**areas):
     poses = tuple(
         AreaPose(int(name[1:]), PoseGaussian(np.array(pose, dtype=np.float64), np.eye(3) * 0.01))
         for name, pose in areas.items()
@@ -70,7 +70,7 @@ def test_an_estimate_between_two_readings_starts_at_its_own_odometry(rtl):
 
 
 def test_the_map_pose_is_the_areas_pose_and_the_pose_in_the_area(rtl):
-    rtl.handle(accepted(a0=(0, 0, 0), a3=(10, 0, math.pi / 2)))
+    rtl.handle(make_decision(a0=(0, 0, 0), a3=(10, 0, math.pi / 2)))
     rtl.handle(odometry(0.0, 0, 0, 0))
     rtl.handle(estimate(0.0, (1, 0, 0), (0, 0, 0), area=3))
     (messages,) = rtl.handle(odometry(0.1, 0.5, 0, 0))
@@ -87,17 +87,17 @@ def test_a_new_area_waits_for_its_place_in_the_map(rtl):
     (before,) = rtl.handle(odometry(0.2, 0.2, 0, 0))
     assert before.area == 0
     assert np.allclose(before.map_pose.mean, (0.2, 0, 0))
-    rtl.handle(accepted(a0=(0, 0, 0), a1=(0.1, 0, 0)))
+    rtl.handle(make_decision(a0=(0, 0, 0), a1=(0.1, 0, 0)))
     (after,) = rtl.handle(odometry(0.3, 0.3, 0, 0))
     assert after.area == 1
     assert np.allclose(after.map_pose.mean, (0.3, 0, 0))
 
 
 def test_the_robots_area_keeps_its_place_when_a_hypothesis_without_it_takes_the_lead(rtl):
-    rtl.handle(accepted(a0=(0, 0, 0), a3=(10, 0, 0)))
+    rtl.handle(make_decision(a0=(0, 0, 0), a3=(10, 0, 0)))
     rtl.handle(odometry(0.0, 0, 0, 0))
     rtl.handle(estimate(0.0, (1, 0, 0), (0, 0, 0), area=3))
-    rtl.handle(accepted(a0=(0, 5, 0), a1=(4, 0, 0)))
+    rtl.handle(make_decision(a0=(0, 5, 0), a1=(4, 0, 0)))
     (messages,) = rtl.handle(odometry(0.1, 0.1, 0, 0))
     assert np.allclose(messages.map_pose.mean, (11.1, 0, 0))
     rtl.handle(estimate(0.2, (2, 0, 0), (0.2, 0, 0), area=1))

@@ -30,7 +30,7 @@ def test_mapping_takes_no_memory_but_for_the_arrays_that_kernels_are_expected_to
     called = {kernel for kernel, taken in counts.items() if taken}
     assert called >= FREE | {"registration.scan_to_map.propose_all"}
     assert not ARRAYS.keys() & FREE
-    assert not [requirement.row for requirement in requirements_on(counts) if not requirement.met]
+    assert not [requirement.row for requirement in requirements_on(counts) if not requirement.is_met]
 
 
 @pytest.mark.parametrize("particles", [1, 60])
@@ -70,5 +70,5 @@ def test_a_kernel_that_takes_memory_is_found_out(monkeypatch):
     with count_allocations() as counts:
         assert scan_to_map.log_prior(np.ones(3), prior) == -1.5
     assert counts["registration.scan_to_map.log_prior"] == [2]
-    assert [requirement.met for requirement in requirements_on(counts)] == [False]
+    assert [requirement.is_met for requirement in requirements_on(counts)] == [False]
     assert scan_to_map.log_prior is log_prior

@@ -97,7 +97,7 @@ def messages() -> list:
     for k in range(SCANS // EVERY):
         sent.append(keyframe(k, {0: 0} if k <= CUT else {1: 1, 2: 0} if k <= VERDICT else {1: 1}))
         sent.append(hypotheses(k))
-        sent.append(accepted(k))
+        sent.append(make_decision(k))
     return [*sent, Notice("slam", "two scans had no beam: clean the laser"), EndOfRun(SCANS, SCANS, 0)]
 
 
@@ -122,7 +122,7 @@ def hypotheses(k: int) -> Hypotheses:
     return Hypotheses(k, (new, Hypothesis(2, 0, 0.3, 0)))
 
 
-def accepted(k: int) -> ClosureDecision:
+def make_decision(k: int) -> ClosureDecision:
     if k == 0:
         return ClosureDecision(k, global_poses=verdict_poses(0))
     if k == CUT:
@@ -141,7 +141,7 @@ FIGURES = RunMetrics(
 )
 
 
-def recorded(order: int = 0, without: type | None = None) -> Recorder:
+def make_recorder(order: int = 0, without: type | None = None) -> Recorder:
     sent = [message for message in messages() if without is None or not isinstance(message, without)]
     recorder = Recorder(with_changes(Configuration(), {"seed": 7, "local_map.cell": 0.1}))
     for index in np.random.default_rng(order).permutation(len(sent)) if order else range(len(sent)):
@@ -149,18 +149,18 @@ def recorded(order: int = 0, without: type | None = None) -> Recorder:
     return recorder
 
 
-def finished(recorder: Recorder) -> FinalMap:
+def finish_map(recorder: Recorder) -> FinalMap:
     return final_map(recorder.finish(STAMPS), map(scan, range(SCANS)), recorder.configuration)
 
 
 def write(directory: Path, recorder: Recorder) -> None:
-    write_output(directory, finished(recorder), SOURCE, FIGURES, recorder.configuration)
+    write_output(directory, finish_map(recorder), SOURCE, FIGURES, recorder.configuration)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("output")
-    write(directory, recorded())
+    write(directory, make_recorder())
     return directory
 
 
@@ -181,12 +181,12 @@ def test_both_trajectories_are_true_and_have_the_logs_own_stamps(folder: Path, n
 
 
 def test_the_order_in_which_messages_arrive_does_not_matter(folder: Path, tmp_path: Path) -> None:
-    write(tmp_path, recorded(order=3))
+    write(tmp_path, make_recorder(order=3))
     assert contents(tmp_path) == contents(folder)
 
 
 def test_a_message_that_comes_twice_counts_once(folder: Path, tmp_path: Path) -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     for message in messages():
         recorder.handle(message)
     write(tmp_path, recorder)
@@ -194,20 +194,20 @@ def test_a_message_that_comes_twice_counts_once(folder: Path, tmp_path: Path) ->
 
 
 def test_the_recorder_is_complete_only_when_everything_has_arrived() -> None:
-    assert recorded().is_complete
+    assert make_recorder().is_complete
     for kind in (EndOfRun, ClosureDecision, Hypotheses, LocalEstimate):
-        assert not recorded(without=kind).is_complete
+        assert not make_recorder(without=kind).is_complete
 
 
 def test_a_lost_message_is_named() -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     del recorder.hypotheses[2]
     with pytest.raises(HmtSlamError, match="Hypotheses 2 was lost"):
         recorder.finish(STAMPS)
 
 
 def test_a_lost_last_message_is_named() -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     del recorder.decisions[SCANS // EVERY - 1]
     with pytest.raises(HmtSlamError, match="was lost"):
         recorder.finish(STAMPS)
@@ -215,16 +215,16 @@ def test_a_lost_last_message_is_named() -> None:
 
 def test_a_run_without_any_pose_is_refused() -> None:
     with pytest.raises(HmtSlamError, match="none of the 24 scans"):
-        recorded(without=LocalEstimate).finish(STAMPS)
+        make_recorder(without=LocalEstimate).finish(STAMPS)
 
 
 def test_a_scan_that_is_not_in_the_log_is_named() -> None:
     with pytest.raises(HmtSlamError, match="is not in the log"):
-        recorded().finish(STAMPS[:-1])
+        make_recorder().finish(STAMPS[:-1])
 
 
 def test_a_scan_without_a_pose_gets_one_between_its_neighbors() -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     trail = recorder.scan_poses.pop((1, 16))
     keep = np.array([True, False, True, True])
     recorder.handle(ScanPoses(1, 16, trail.stamps[keep], trail.keyframes[keep], trail.poses[keep]))
@@ -232,7 +232,7 @@ def test_a_scan_without_a_pose_gets_one_between_its_neighbors() -> None:
 
 
 def test_an_area_that_no_verdict_placed_is_placed_along_the_arcs() -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     recorder.decisions[CUT] = ClosureDecision(CUT)
     recording = recorder.finish(STAMPS)
     np.testing.assert_allclose(recording.area_poses[1].mean, MAP_T_AREA_1)
@@ -284,7 +284,7 @@ def test_the_map_shows_the_round_room(folder: Path) -> None:
 
 def test_the_saved_map_reads_back_complete(folder: Path) -> None:
     saved = read_saved_map(folder / "hmt_map")
-    recording = finished(recorded()).recording
+    recording = finish_map(make_recorder()).recording
     hybrid_map = saved.replica.maps[1]
     assert saved.replica.best_hypothesis == recording.replica.best_hypothesis == 1
     assert saved.configuration.seed == 7
@@ -302,7 +302,7 @@ def test_the_saved_map_reads_back_complete(folder: Path) -> None:
 
 
 def test_the_saved_map_keeps_every_live_hypothesis(tmp_path: Path) -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     for k in range(VERDICT, SCANS // EVERY):
         recorder.hypotheses[k] = Hypotheses(k, (Hypothesis(1, 1, 0.6, 1), Hypothesis(2, 2, 0.4, 0)))
         recorder.decisions[k] = ClosureDecision(k)
@@ -314,7 +314,7 @@ def test_the_saved_map_keeps_every_live_hypothesis(tmp_path: Path) -> None:
 
 
 def test_the_saved_map_keeps_that_a_hypothesis_lacks_an_arc(tmp_path: Path) -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     for k in range(VERDICT, SCANS // EVERY):
         withdrawn = (ArcEnds(0, 1),) if k == VERDICT else ()
         recorder.hypotheses[k] = Hypotheses(

@@ -22,7 +22,7 @@ FAR = np.array([300.0, -200.0, 1.2])
 KNOWN, CORRECTED = np.array([0.0, 0.0, 0.0]), np.array([0.4, -0.2, 0.02])
 
 
-def driven(time, corrected=CORRECTED, steps=100):
+def drive_poses(time, corrected=CORRECTED, steps=100):
     """Poses in the map as they are shown and known while the robot drives, corrected before the first step."""
     correction = CorrectionSmoother()
     correction.smooth(0, KNOWN, FAR, time)
@@ -36,13 +36,13 @@ def driven(time, corrected=CORRECTED, steps=100):
 
 
 def test_a_correction_is_made_at_once_where_no_time_is_given():
-    shown, known = driven(time=0.0)
+    shown, known = drive_poses(time=0.0)
     np.testing.assert_allclose(shown, known, atol=1e-9)
 
 
 def test_a_correction_falls_to_a_third_in_its_time_without_a_jump():
     near = np.array([1e-3, 2e-3, 1e-5])
-    shown, known = driven(time=0.5, corrected=near)
+    shown, known = drive_poses(time=0.5, corrected=near)
     left = se2.log(se2.between(known, shown))
     first = se2.log(se2.between(se2.compose(near, FAR), FAR))
     # What is left turns with the robot: by 1e-5 on 0.3 m.
@@ -53,7 +53,7 @@ def test_a_correction_falls_to_a_third_in_its_time_without_a_jump():
 
 def test_what_is_no_correction_but_another_place_is_shown_at_once():
     # A turn of 1.1 degrees about odometry's origin, 360 m away, moves the robot by 7 m.
-    shown, known = driven(time=0.5)
+    shown, known = drive_poses(time=0.5)
     np.testing.assert_allclose(shown, known, atol=1e-6)
 
 

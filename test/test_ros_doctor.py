@@ -30,7 +30,7 @@ BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 def doctor(listener):
     """Runs it for some seconds, meanwhile spins the test's own nodes, and returns status and findings."""
 
-    def examined(seconds, *arguments, meanwhile=lambda: None):
+    def run_doctor(seconds, *arguments, meanwhile=lambda: None):
         command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "doctor", "--live", "--json"]
         process = subprocess.Popen(
             [*command, "--seconds", str(seconds), *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -42,7 +42,7 @@ def doctor(listener):
         assert not error
         return process.returncode, json.loads(messages)["findings"]
 
-    return examined
+    return run_doctor
 
 
 def texts(findings, *severities):

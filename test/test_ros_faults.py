@@ -43,9 +43,9 @@ def kill(process):
 
 def restart(nodes, name, before, **parameters):
     """Start a node that was killed; wait until it has taken over."""
-    said = len(nodes.diagnostics)
+    status_message = len(nodes.diagnostics)
     nodes.alive[before] = nodes.start(name, **parameters)
-    nodes.until(lambda: any(m.status[0].name == f"/{name}" for m in nodes.diagnostics[said:]))
+    nodes.until(lambda: any(m.status[0].name == f"/{name}" for m in nodes.diagnostics[status_message:]))
 
 
 def corridor_measurements(scans):
@@ -73,7 +73,7 @@ class Driver:
     def close(self):
         self._own.close()
 
-    def answered(self):
+    def answered_stamps(self):
         """Stamps of the scans that have a pose, ns."""
         return [decode(message.data, LocalEstimate).stamp for message in self._nodes.estimates]
 
@@ -106,15 +106,17 @@ def test_rtl_that_is_killed_goes_on_with_the_pose_and_the_parameters_that_it_had
     kill(process)
     assert list(tmp_path.iterdir())
 
-    said, received = len(placed), len(reported)
+    status_message, received = len(placed), len(reported)
     process = start("rtl", recovery=tmp_path)
     listener.until(lambda: len(reported) > received, alive=[process])
-    assert len(placed) == said  # nothing that is past
-    while len(placed) < said + 1:
+    assert len(placed) == status_message  # nothing that is past
+    while len(placed) < status_message + 1:
         drive()
         listener.spin(0.05)
-    moved = conversions.stamp_from_time(placed[said].header.stamp) / 20_000_000 - 1
-    assert conversions.pose_from_message(placed[said].pose.pose) == pytest.approx([1.0 + 0.01 * moved, 2.0, 0.0])
+    moved = conversions.stamp_from_time(placed[status_message].header.stamp) / 20_000_000 - 1
+    assert conversions.pose_from_message(placed[status_message].pose.pose) == pytest.approx(
+        [1.0 + 0.01 * moved, 2.0, 0.0]
+    )
     # The answer of the dead one would be waited for.
     client = listener.node.create_client(GetParameters, "rtl/get_parameters")
     future = client.call_async(GetParameters.Request(names=["rtl.publish_tf"]))
@@ -160,15 +162,17 @@ def test_all_are_killed_with_the_transform_of_the_laser_and_continue_without_it(
     nodes.until(lambda: len(nodes.estimates) == 30)
     for process in nodes.alive:
         kill(process)
-    said = len(nodes.diagnostics)
+    status_message = len(nodes.diagnostics)
     nodes.alive = [start(name, recovery=tmp_path / "recovery") for name in NODES]
-    nodes.until(lambda: {m.status[0].name for m in nodes.diagnostics[said:]} >= {f"/{name}" for name in NODES})
+    nodes.until(
+        lambda: {m.status[0].name for m in nodes.diagnostics[status_message:]} >= {f"/{name}" for name in NODES}
+    )
     driver = Driver(nodes, domain)
     for one in corridor_measurements(60)[150:]:
         driver.send(one)
-    nodes.until(lambda: driver.answered()[-1] == START + 59 * 200_000_000)
+    nodes.until(lambda: driver.answered_stamps()[-1] == START + 59 * 200_000_000)
     # What was under way when they were killed is reported again.
-    assert sorted(set(driver.answered())) == [START + k * 200_000_000 for k in range(60)]
+    assert sorted(set(driver.answered_stamps())) == [START + k * 200_000_000 for k in range(60)]
     end = 4 * 59 * PACE
     nodes.until(
         lambda: nodes.poses and np.abs(conversions.pose_from_message(nodes.poses[-1].pose.pose) - end).max() < 0.1
@@ -181,7 +185,7 @@ def test_all_are_killed_with_the_transform_of_the_laser_and_continue_without_it(
         assert "was killed and goes on where it was" in process.communicate(timeout=20)[1]
 
 
-def disturbed(measurements, period):
+def disturb(measurements, period):
     """Measurements of one kind, ``period`` ns apart, as (time of arrival, measurement).
 
     Some come after their successor, some 0.3 s late, some twice, and one 5 s late.
@@ -204,17 +208,17 @@ def test_what_comes_late_twice_or_out_of_order_is_left_out_and_counted_and_all_e
     driver = Driver(nodes, domain)
     kinds = {Scan: SECOND // 5, Odometry: SECOND // 20}
     sent = {kind: [one for one in corridor_measurements(60) if isinstance(one, kind)] for kind in kinds}
-    arrivals = sorted((entry for kind in kinds for entry in disturbed(sent[kind], kinds[kind])), key=lambda e: e[0])
+    arrivals = sorted((entry for kind in kinds for entry in disturb(sent[kind], kinds[kind])), key=lambda e: e[0])
     came = {kind: [one.stamp for _, one in arrivals if isinstance(one, kind)] for kind in kinds}
     used = {kind: in_order(came[kind]) for kind in kinds}
     assert all(len(came[kind]) > len(sent[kind]) > len(used[kind]) for kind in kinds)
     for number, (_, one) in enumerate(arrivals):
         driver.send(one)
         # As a laser does, which waits for nobody, but no faster than slam is on a computer that is busy.
-        nodes.until(lambda now=one.stamp: now < 2 * SECOND + (driver.answered() or [START])[-1])
+        nodes.until(lambda now=one.stamp: now < 2 * SECOND + (driver.answered_stamps() or [START])[-1])
         if number == len(arrivals) // 2:
             nodes.until(lambda: nodes.diagnosis("rtl")["received LocalEstimate"])
-    nodes.until(lambda: driver.answered() == used[Scan])
+    nodes.until(lambda: driver.answered_stamps() == used[Scan])
     nodes.until(lambda: nodes.poses and conversions.stamp_from_time(nodes.poses[-1].header.stamp) == used[Odometry][-1])
     for message in nodes.poses:
         assert_true(message, START)
@@ -296,17 +300,17 @@ def test_a_missing_transform_and_clocks_that_are_apart_are_reported_with_the_rem
         else:
             odom.publish(conversions.odometry_message(one, "odom", "base_link"))
 
-    def said():
+    def status_message():
         return next((m.status[0].message for m in reversed(reported) if m.status[0].name == "/slam"), "")
 
-    listener.until(lambda: "no transform" in said(), alive=[process])
-    assert said() == (
+    listener.until(lambda: "no transform" in status_message(), alive=[process])
+    assert status_message() == (
         "no transform from 'base_link' to 'laser' on /tf_static, so 55 scans wait, the first of stamp "
         f"{measurements[0].stamp + hour} ns: publish it, or set the parameter laser_pose"
     )
     assert not keyframes
     static.publish(TFMessage(transforms=[conversions.transform_message(0, "base_link", "laser", np.zeros(3))]))
-    listener.until(lambda: keyframes and "no transform" not in said(), alive=[process])
+    listener.until(lambda: keyframes and "no transform" not in status_message(), alive=[process])
     process.send_signal(signal.SIGINT)
     error = process.communicate(timeout=20)[1]
     assert " s after the odometry that comes with them: let both computers have one clock" in error

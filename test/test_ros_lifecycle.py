@@ -126,13 +126,13 @@ def test_a_node_that_starts_late_catches_up(listener, start):
         accepted.publish(String(data=encode(ClosureDecision(sequence))))
     process = start("rtl")
 
-    def received():
+    def status_values():
         status = level(reported, "rtl")
         return {entry.key: entry.value for entry in status.values} if status else {}
 
-    listener.until(lambda: received().get("received ClosureDecision") == "3", alive=[process])
-    listener.until(lambda: received().get("received Hypotheses") == "3", alive=[process])
-    listener.until(lambda: received().get("waiting for their turn") == "0", alive=[process])
+    listener.until(lambda: status_values().get("received ClosureDecision") == "3", alive=[process])
+    listener.until(lambda: status_values().get("received Hypotheses") == "3", alive=[process])
+    listener.until(lambda: status_values().get("waiting for their turn") == "0", alive=[process])
 
 
 def test_rtl_answers_every_odometry_reading(listener, start):
@@ -188,11 +188,11 @@ def test_a_best_effort_driver_is_received_too(listener, start):
     process = start("rtl")
     reading = Odometry(0, np.zeros(3))
 
-    def counted():
+    def has_count():
         status = level(reported, "rtl")
         return status is not None and any(entry.key == "received Odometry" for entry in status.values)
 
-    while not counted():
+    while not has_count():
         reading = Odometry(reading.stamp + 20_000_000, reading.pose)
         live.publish(conversions.odometry_message(reading, "odom", "base_link"))
         listener.spin(0.1)

@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from door_floor import ROOM, in_hallway, scripted, write_world
+from door_floor import ROOM, in_hallway, scripted_drive, write_world
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -28,7 +28,7 @@ PROCESSES = process_names()
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory):
+def mapped_world(tmp_path_factory):
     """The world, and the folder of its map."""
     folder = tmp_path_factory.mktemp("floor")
     world, out = write_world(folder), folder / "out"
@@ -37,8 +37,8 @@ def mapped(tmp_path_factory):
     return world, out
 
 
-def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, start):
-    world, out = mapped
+def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped_world, listener, start):
+    world, out = mapped_world
     # Slam alone would not look for the robot before it is there.
     shared = {"start_from": out, "mode": "localization", "tsbi__recheck_keyframes": 100}
     outcomes = listener.subscribe(String, "pilot/task_result", topics.LATCHED)
@@ -71,7 +71,7 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, star
     listener.until(lambda: len(outcomes) == 2, alive=[pilot, robot, *others])
     assert outcomes[1].data == f"go {room}: the robot is there"
     # The map's frame is where the scripted drive began.
-    origin = scripted(world)[1][0]
+    origin = scripted_drive(world)[1][0]
     (goal,) = goals
     assert goal.header.frame_id == "map"
     place = se2.compose(origin, pose_from_message(goal.pose))

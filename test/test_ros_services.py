@@ -41,7 +41,7 @@ def corridor(tmp_path_factory):
     return mapped_corridor(tmp_path_factory.mktemp("corridor"))
 
 
-def occupied(grid):
+def count_occupied(grid):
     return int((np.frombuffer(grid.data, dtype=np.int8) == 100).sum())
 
 
@@ -61,7 +61,7 @@ def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corr
     nodes.until(lambda: len(nodes.estimates) == 10)
     nodes.park()
     little = listener.call(GetMap, "tlca/get_map", GetMap.Request()).map
-    assert occupied(little) > 20
+    assert count_occupied(little) > 20
 
     assert load(listener, tmp_path / "nowhere").result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
     shutil.copytree(out / "hmt_map", tmp_path / "damaged")
@@ -73,9 +73,9 @@ def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corr
     grids = listener.subscribe(OccupancyGrid, MAP, topics.LATCHED)
     answer = load(listener, f"file://{out}")
     assert answer.result == LoadMap.Response.RESULT_SUCCESS
-    assert occupied(answer.map) > 2 * occupied(little)
+    assert count_occupied(answer.map) > 2 * count_occupied(little)
     nodes.until(lambda: not nodes.is_localized())
-    nodes.until(lambda: grids and occupied(grids[-1]) == occupied(answer.map))
+    nodes.until(lambda: grids and count_occupied(grids[-1]) == count_occupied(answer.map))
     nodes.drive(log, first=20, rate=8.0)
     nodes.until(nodes.is_localized)
     nodes.until(lambda: last(nodes).scan_index == SCANS + (SCANS - 20) - 1)
@@ -101,7 +101,7 @@ def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_messages_can_
     nodes.until(nodes.is_localized)
     # In the frame of the first scan after it.
     nodes.until(lambda: nodes.poses and abs(pose_from_message(nodes.poses[-1].pose.pose)[0] - 4 * 39 * PACE[0]) < 0.3)
-    assert occupied(listener.call(GetMap, "tlca/get_map", GetMap.Request()).map) > 20
+    assert count_occupied(listener.call(GetMap, "tlca/get_map", GetMap.Request()).map) > 20
     assert listener.call(Trigger, "slam/save", Trigger.Request()).success
     nodes.until(lambda: set(recording.counts) >= SAID)
     recording.close()

@@ -118,7 +118,7 @@ def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_o
     manager.lead(DOWN, "deactivate", "inactive")
     assert listener.call(Trigger, "slam/save", Trigger.Request()).success
     FolderReader(saved, FORMAT, VERSION)
-    restarted(manager, nodes, log)
+    restart_all(manager, nodes, log)
     assert estimates_of(nodes, SCANS) == estimates_of(nodes, 0)[:SCANS]
 
     shutil.rmtree(saved)
@@ -163,7 +163,7 @@ def stands(nodes):
     assert before < SCANS
 
 
-def restarted(manager, nodes, log):
+def restart_all(manager, nodes, log):
     """Slam alone does not restart, all five do."""
     manager.lead(["slam"], "cleanup", "unconfigured")
     assert not manager.change("slam", "configure")

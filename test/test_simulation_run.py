@@ -22,15 +22,15 @@ def hmt_slam(*arguments):
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory):
+def mapped_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "out"
     messages = hmt_slam("map", LOG, "--out", folder)
     return folder, messages
 
 
-def test_a_small_loop_is_closed_and_mapped_to_two_centimeters(mapped):
+def test_a_small_loop_is_closed_and_mapped_to_two_centimeters(mapped_folder):
     """Two laps of 45 m: the mean error of relations to the next meters, and to where the robot was a lap before."""
-    folder, messages = mapped
+    folder, messages = mapped_folder
     assert "0 dropped" in messages
     assert "loop closures: 0" not in messages
     errors = evaluate_relations(read_tum(folder / "trajectory.tum"), true_relations(read_true_poses(open_log(LOG))))
@@ -41,8 +41,8 @@ def test_a_small_loop_is_closed_and_mapped_to_two_centimeters(mapped):
         assert score.rotation.mean < 0.2
 
 
-def test_its_bag_makes_the_same_map_as_far_as_quaternions_are_exact(mapped, tmp_path):
-    folder, _ = mapped
+def test_its_bag_makes_the_same_map_as_far_as_quaternions_are_exact(mapped_folder, tmp_path):
+    folder, _ = mapped_folder
     hmt_slam("simulate", "ring", "--seed", "2", "--set", "size=0.8", "--out", tmp_path / "bag")
     hmt_slam("map", tmp_path / "bag", "--out", tmp_path / "out")
     found, expected = (np.loadtxt(out / "trajectory.tum") for out in (tmp_path / "out", folder))

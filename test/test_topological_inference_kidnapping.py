@@ -33,7 +33,7 @@ NOWHERE = np.concatenate((box(-1.0, 1.0, 4.2, 6.5), box(2.6, 4.0, 3.6, 5.0)))
 HALL = np.concatenate((box(-3.0, 0.5, 9.0, 4.5), box(4.0, 3.0, 5.0, 4.0)))
 
 
-def requested(rooms, inconsistencies, first=FAR, hall=2):
+def spawn_branches(rooms, inconsistencies, first=FAR, hall=2):
     """The branches by inconsistencies in the last room, {keyframe of it: nats}; all arcs but the first lead far off.
 
     The robot was kidnapped there from a hall, in which it stored ``hall`` keyframes.
@@ -53,7 +53,7 @@ def since(child):
 
 
 def test_the_keyframes_since_then_begin_an_area_of_which_nothing_tells_where_it_is():
-    stays, lost = requested((ROOM, OTHER, ROOM), {2: 8.0}).children
+    stays, lost = spawn_branches((ROOM, OTHER, ROOM), {2: 8.0}).children
     assert (stays.area, stays.log_weight, stays.moved_keyframes) == (2, 0.0, ())
     assert lost.area == 3
     assert lost.state.localization.since == 14
@@ -69,7 +69,7 @@ def test_the_keyframes_since_then_begin_an_area_of_which_nothing_tells_where_it_
 
 
 def test_that_the_place_is_known_elsewhere_speaks_for_it_and_one_look_has_found_it():
-    _, lost = requested((ROOM, OTHER, ROOM), {2: 8.0}).children
+    _, lost = spawn_branches((ROOM, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight > PRIOR + 8.0 + 1.0
     assert lost.state.localization.counted_evidence == pytest.approx(lost.log_weight - PRIOR - 8.0)
     assert lost.state.localization.candidate.area == 0
@@ -105,13 +105,13 @@ def test_where_nothing_is_stored_it_goes_over_into_the_area_where_it_was_recogni
 
 
 def test_on_ground_that_nobody_knows_the_inconsistencies_alone_speak_for_it():
-    _, lost = requested((OTHER, OTHER, ROOM), {2: 8.0}).children
+    _, lost = spawn_branches((OTHER, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight == pytest.approx(PRIOR + 8.0 + math.log(KIDNAPPED_UNMAPPED_PRIOR), abs=0.5)
     assert lost.state.localization.candidate is None
 
 
 def test_that_the_place_is_known_where_the_robot_would_be_anyway_speaks_against_it():
-    _, lost = requested((ROOM, OTHER, ROOM), {2: 8.0}, HERE, hall=0).children
+    _, lost = spawn_branches((ROOM, OTHER, ROOM), {2: 8.0}, HERE, hall=0).children
     assert lost.log_weight < PRIOR + 8.0 - 2.0
 
 
@@ -121,11 +121,11 @@ def test_that_the_place_is_known_where_the_robot_would_be_anyway_speaks_against_
     ids=["sure", "hardly doubtful", "just now, and two keyframes are too few"],
 )
 def test_a_robot_that_is_hardly_displaced_is_not_examined(inconsistencies):
-    assert requested((ROOM, OTHER, ROOM), inconsistencies) is None
+    assert spawn_branches((ROOM, OTHER, ROOM), inconsistencies) is None
 
 
 def test_an_area_is_not_left_without_keyframes():
-    _, lost = requested((ROOM, OTHER, ROOM), {0: 8.0}).children
+    _, lost = spawn_branches((ROOM, OTHER, ROOM), {0: 8.0}).children
     assert [r.keyframe for r in lost.moved_keyframes] == [13, 14, 15, 16, 17]
 
 

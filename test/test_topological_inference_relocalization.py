@@ -42,7 +42,7 @@ def begin(office):
     return [scan for scan in office.scans if office.records[scan].measurement.stamp in known][60]
 
 
-def kidnapped(office, records, scans):
+def start_in_map(office, records, scans):
     """A run that started in a map and read so many scans."""
     run = LockStepRun(Configuration(), state=office.state)
     run.lock_step.feed(PoseReset())
@@ -56,7 +56,7 @@ def kidnapped(office, records, scans):
 
 def test_it_begins_a_new_area_to_which_an_arc_leads_that_has_no_information(office, begin):
     before = Replica.from_state(office.state.processes["tsbi"].replica)
-    run = kidnapped(office, office.records[begin:], 10)
+    run = start_in_map(office, office.records[begin:], 10)
     replica = Replica.from_state(run.state.processes["tsbi"].replica)
     (hypothesis,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
     assert hypothesis.lost
@@ -112,7 +112,7 @@ def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, m
         return looks[-1]._replace(candidates=tuple(moved))
 
     monkeypatch.setattr(ClosureSearch, "localize_globally", off_at_times)
-    run = kidnapped(office, office.records[begin:], 150)
+    run = start_in_map(office, office.records[begin:], 150)
     (hypothesis,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
     assert sum(look.best is not None and look.best[1] > 0.9 for look in looks) >= 3
     assert hypothesis.lost
@@ -120,7 +120,7 @@ def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, m
 
 @pytest.mark.parametrize("seed", [4, 5, 6, 7])
 def test_in_a_building_that_it_does_not_know_it_stays_lost(office, seed):
-    run = kidnapped(office, open_log(f"sim:grid,seed={seed},size=0.7").records(), 150)
+    run = start_in_map(office, open_log(f"sim:grid,seed={seed},size=0.7").records(), 150)
     assert all(hypothesis.lost for hypothesis in run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses)
 
 
@@ -148,7 +148,7 @@ def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(
 
 
 def test_scans_are_counted_on_and_odometry_restarts(office, begin):
-    run = kidnapped(office, office.records[begin:], 25)
+    run = start_in_map(office, office.records[begin:], 25)
     assert run.state.processes["slam"].processed_scans == office.state.processes["slam"].processed_scans + 25
     assert run.state.processes["slam"].dropped_scans == 0
 

@@ -92,7 +92,7 @@ def head(sequence, stamp):
 def test_events_are_reported_once_in_order_when_both_halves_are_there_and_a_new_run_restarts(board):
     history, seen = KeyframeHistory(board), ClientState()
 
-    def reported(*messages):
+    def new_events(*messages):
         for message in messages:
             history.add(message)
         history.publish_complete()
@@ -100,11 +100,11 @@ def test_events_are_reported_once_in_order_when_both_halves_are_there_and_a_new_
         return changes["anew"], [event["event"] for event in changes["events"]]
 
     answers = [Hypotheses(k, (Hypothesis(3, 0, 0.25, 5), Hypothesis(1, 0, 0.75, 4, lost=True))) for k in range(3)]
-    assert reported(answers[1], answers[0]) == (True, [])
-    assert reported(head(1, 7_000_000_000), head(0, 5_500_000_000)) == (False, [0, 1])
-    assert reported(head(2, 9_000_000_000), answers[0], answers[1], head(0, 5_500_000_000)) == (False, [])
-    assert reported(answers[2]) == (False, [2])
-    assert reported(head(0, 20_000_000_000), answers[0]) == (True, [0])
+    assert new_events(answers[1], answers[0]) == (True, [])
+    assert new_events(head(1, 7_000_000_000), head(0, 5_500_000_000)) == (False, [0, 1])
+    assert new_events(head(2, 9_000_000_000), answers[0], answers[1], head(0, 5_500_000_000)) == (False, [])
+    assert new_events(answers[2]) == (False, [2])
+    assert new_events(head(0, 20_000_000_000), answers[0]) == (True, [0])
     (event,) = board.wait_for_changes(ClientState())["history"]["events"]
     assert event == {
         "event": 0,
@@ -226,8 +226,8 @@ def test_a_node_that_is_halted_is_named_rather_than_the_pose_that_does_not_come(
     health = SystemHealth(NODES)
     well(health, 0.0)
     health.update("rtl", 0, "inactive", {"state": "inactive"}, 0.0)
-    reported = {"level": "waiting", "text": "rtl is inactive.", "advice": "ros2 lifecycle set /rtl activate"}
-    assert health.verdict(1.0) == reported
+    new_events = {"level": "waiting", "text": "rtl is inactive.", "advice": "ros2 lifecycle set /rtl activate"}
+    assert health.verdict(1.0) == new_events
     assert health.rows(1.0)[1]["level"] == "waiting"
     health.update("rtl", 0, "running", {"state": "active"}, 1.0)
     assert "no pose came yet" in health.verdict(2.0)["text"]

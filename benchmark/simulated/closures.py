@@ -104,7 +104,7 @@ class Paths:
         way = examination.kind if examination else "tracked"
         return Closure(event, way, (other, known_area), assessment)
 
-    def accepted(self, hypothesis: int, chosen: HybridMap) -> list[Closure]:
+    def take_accepted(self, hypothesis: int, chosen: HybridMap) -> list[Closure]:
         """The closures that become definite with a hypothesis, with their current errors."""
         path = self.paths[hypothesis]
         self.paths = {hypothesis: replace(path, wrong=False, closures=())}

@@ -72,7 +72,7 @@ class Examination:
         """All areas in which the keyframes could have been found."""
         return [area for area in self.hybrid_map.area_ids() if area not in self.excluded]
 
-    def unmatched(self, area: int) -> dict[int, Pose]:
+    def unmatched_keyframes(self, area: int) -> dict[int, Pose]:
         """{keyframe: ``reference_T_base``} of those not compared with an area before."""
         return {k: pose for k, pose in self.query.poses.items() if k not in self.compared.get(area, ())}
 
@@ -281,7 +281,7 @@ class _Candidate:
 
     def __init__(self, examination: Examination, truth: Truth, configuration: Configuration, area: int) -> None:
         self._examination, self._truth, self._options, self._area = examination, truth, configuration.tsbi, area
-        self.unmatched = examination.unmatched(area)
+        self.unmatched = examination.unmatched_keyframes(area)
         self.known = examination.hybrid_map.keyframes(area)
         belief = shortest_path_beliefs(examination.hybrid_map, examination.parent.area)[area]
         prior = belief.inverse().compose(examination.query.belief)

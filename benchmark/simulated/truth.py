@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmark.landmark_truth import World
+from benchmark.landmark_truth import Surroundings
 from hmt_slam_ros.area_abstraction.doors import MAX_STEP, find_crossings
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
@@ -256,7 +256,7 @@ def _distance_from_gap(truth: Truth, place: Array, configuration: Configuration)
     least = math.inf
     for k, pose in truth.poses.items():
         if math.dist(pose[:2], place) <= _AROUND:
-            gaps = World(truth.log.scenario, truth.stamps[k], pose).openings(configuration.features).poses
+            gaps = Surroundings(truth.log.scenario, truth.stamps[k], pose).openings(configuration.features).poses
             away = se2.compose(pose, gaps)[:, :2] - place
             least = min(least, float(np.hypot(*away.T).min(initial=math.inf)))
     return least

@@ -177,7 +177,7 @@ class Watch:
         if decision.hypothesis is None:
             return
         chosen = self._replica.maps[decision.hypothesis]
-        for closure in self._paths.accepted(decision.hypothesis, chosen):
+        for closure in self._paths.take_accepted(decision.hypothesis, chosen):
             self.accepted.append(self._closure_entry(closure, decision.sequence, probabilities[decision.hypothesis]))
         self.loops.update_definite(decision.sequence, chosen, self._replica.robot_areas[decision.hypothesis])
 
