@@ -1,4 +1,4 @@
-"""Make the virtual environment in which the tests and the demonstration run, and keep it up to date.
+"""Make the virtual environment for tests and the demonstration, and keep it up to date.
 
 Where a Jazzy is sourced, its packages are used and only what it lacks is installed. Elsewhere a real rclpy comes from
 PyPI, and tf2_msgs, of which PyPI has no wheel, is compiled from scripts/tf2_msgs. Nothing but the standard library is
@@ -26,7 +26,7 @@ REQUIREMENTS = ROOT / "requirements"
 
 
 class EnvironmentSetupError(Exception):
-    """What hinders the environment, in one sentence that names the remedy."""
+    """An error of the setup, in one sentence with the remedy."""
 
 
 @dataclass
@@ -49,11 +49,11 @@ class Environment:
         return self.path / "bin" / "python"
 
     def stamp(self, step: str) -> Path:
-        """The file that holds the fingerprint of what a step was last done with."""
+        """The file with the fingerprint of the last inputs of a step."""
         return self.path / f"{step}.stamp"
 
     def is_up_to_date(self, step: str, wanted: str) -> bool:
-        """Return whether a step was done with what has this fingerprint."""
+        """Whether the last inputs of a step have a fingerprint."""
         return self.python.exists() and self.stamp(step).is_file() and self.stamp(step).read_text() == wanted
 
     def report_progress(self, text: str) -> None:

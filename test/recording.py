@@ -13,7 +13,7 @@ LOOK = 0.2  # s
 
 
 class Recording:
-    """Subscribes to every topic as soon as somebody publishes it, and keeps the bytes that come.
+    """Subscribes to every topic as soon as it has a publisher, and keeps the bytes that come.
 
     :ivar counts: messages of each topic, {topic: count}; that they can be read by others is seen to as they come.
     :ivar offered: {topic: (type, profiles of the publishers)}.

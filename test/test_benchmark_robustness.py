@@ -75,14 +75,14 @@ def errors_of_shift(x, turn=0.0):
 
 
 def test_a_map_of_the_right_topology_is_distinguished_from_wrong_ones():
-    assert TopologyVerdict(scores(0.3), errors_of_shift(0.1)).right
-    assert TopologyVerdict(scores(0.3)).right
-    assert not TopologyVerdict(scores(1.1), errors_of_shift(0.1)).right
-    assert not TopologyVerdict(scores(0.3), errors_of_shift(0.6)).right
-    assert not TopologyVerdict(scores(0.3), errors_of_shift(0.0, np.radians(11.0))).right
-    assert not TopologyVerdict(scores(0.3), (*errors_of_shift(0.0), *errors_of_shift(3.0))).right
-    assert not TopologyVerdict(scores(float("nan")), errors_of_shift(0.0)).right
-    assert not TopologyVerdict(None).right
+    assert TopologyVerdict(scores(0.3), errors_of_shift(0.1)).is_right
+    assert TopologyVerdict(scores(0.3)).is_right
+    assert not TopologyVerdict(scores(1.1), errors_of_shift(0.1)).is_right
+    assert not TopologyVerdict(scores(0.3), errors_of_shift(0.6)).is_right
+    assert not TopologyVerdict(scores(0.3), errors_of_shift(0.0, np.radians(11.0))).is_right
+    assert not TopologyVerdict(scores(0.3), (*errors_of_shift(0.0), *errors_of_shift(3.0))).is_right
+    assert not TopologyVerdict(scores(float("nan")), errors_of_shift(0.0)).is_right
+    assert not TopologyVerdict(None).is_right
 
 
 def test_runs_with_degraded_odometry_are_scored_and_a_failed_one_is_wrong(tmp_path):

@@ -27,7 +27,7 @@ def test_a_run_that_leaves_something_behind_does_not_do():
         {"dropped": 1},
         {"errors": {"/slam": "x"}},
         {"statuses": {"slam": -9}},
-        {"driven": 500.0},
+        {"log_seconds": 500.0},
         {"resident": {"slam": [100 + k for k in range(100)]}},
     ):
         assert sum(not one.is_met for one in requirements(Soak(**{**vars(good), **fault}))) == 1
@@ -37,4 +37,4 @@ def test_a_run_that_is_too_short_for_that_is_refused(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["soak", "--minutes", "1"])
     assert ended.value.code == 2
-    assert "1 tells nothing of memory: give 2 minutes or more" in capsys.readouterr().err
+    assert "1 minutes are too few for the growth of memory: give 2 or more" in capsys.readouterr().err

@@ -9,17 +9,17 @@ RIGHT, WRONG = Proposal(220.0, (0.1, 1.0)), Proposal(50.0, (6.0, 1.0))
 
 
 def test_a_proposal_is_right_where_the_areas_lie_so():
-    assert RIGHT.right
-    assert not WRONG.right
-    assert not Proposal(220.0, (0.1, 90.0)).right
-    assert not Proposal(220.0, None).right
+    assert RIGHT.is_right
+    assert not WRONG.is_right
+    assert not Proposal(220.0, (0.1, 90.0)).is_right
+    assert not Proposal(220.0, None).is_right
 
 
 def test_a_loop_is_closed_at_the_first_right_closure_behind_its_begin():
     closures = [
-        AcceptedClosure(100.0, right=True),
-        AcceptedClosure(210.0, right=False),
-        AcceptedClosure(240.0, right=True),
+        AcceptedClosure(100.0, is_right=True),
+        AcceptedClosure(210.0, is_right=False),
+        AcceptedClosure(240.0, is_right=True),
     ]
     assert LoopDrive(400.0, [200.0], [], closures).closing_distances == [40.0]
     assert LoopDrive(400.0, [200.0], [], closures[:2]).closing_distances == []
@@ -27,7 +27,7 @@ def test_a_loop_is_closed_at_the_first_right_closure_behind_its_begin():
 
 def test_what_is_required():
     nothing = [Proposal(float(at), None) for at in (30, 60, 250)]
-    good = LoopDrive(400.0, [200.0], [*nothing, RIGHT], [AcceptedClosure(240.0, right=True)])
+    good = LoopDrive(400.0, [200.0], [*nothing, RIGHT], [AcceptedClosure(240.0, is_right=True)])
     control = LoopDrive(400.0, [200.0], [], [])
     assert all(one.is_met for one in requirements([good], [control]))
     false = {one.name: one.is_met for one in requirements([good._replace(proposals=[WRONG])], [control])}
@@ -39,11 +39,11 @@ def test_what_is_required():
 
 
 def test_elsewhere_nothing_false_is_proposed_or_closed():
-    good = LoopDrive(400.0, [], [RIGHT, Proposal(60.0, None)], [AcceptedClosure(240.0, right=True)])
+    good = LoopDrive(400.0, [], [RIGHT, Proposal(60.0, None)], [AcceptedClosure(240.0, is_right=True)])
     assert all(one.is_met for one in elsewhere_requirements([good, good]))
     proposed, closed = elsewhere_requirements([good, good._replace(proposals=[WRONG])])
     assert (proposed.is_met, closed.is_met) == (False, True)
-    proposed, closed = elsewhere_requirements([good._replace(accepted=[AcceptedClosure(90.0, right=False)]), good])
+    proposed, closed = elsewhere_requirements([good._replace(accepted=[AcceptedClosure(90.0, is_right=False)]), good])
     assert (proposed.is_met, closed.is_met) == (True, False)
 
 

@@ -277,7 +277,7 @@ def test_places_beside_each_other_are_joined_whatever_stands_about() -> None:
 
 
 def make_survey(poses: list[tuple[float, float, float]], walls: Float64, person: Float64, until: int = 0) -> Roadmap:
-    """A survey of a floor with keyframes at these poses, one after the other, somebody (1, 3) being there at first.
+    """A survey of a floor with keyframes at these poses, one after the other, with a person at (1, 3) at first.
 
     :param until: this keyframe.
     """

@@ -186,7 +186,7 @@ def test_a_robot_that_left_a_room_looks_where_the_metric_filter_says(known_build
     belief = certain_belief(known_building.graph, CONFIGURATION.places, state_of(goal.node, eastwards(known_building)))
     robot = Robot(MissionController(known_building, CONFIGURATION, LIMITS, belief), (5.0, 0.0, 0.0))
     assert list(robot.go(goal))[-1] is Phase.THERE
-    # Somebody made it turn at the end of its way out.
+    # It turned at the end of its way out.
     out = iter(robot.go(goal._replace(node=node_at(known_building, 10.0))))
     while robot.pose[1] > 0.75:
         assert next(out) is Phase.LEAVING

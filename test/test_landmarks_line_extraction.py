@@ -130,7 +130,7 @@ def test_lines_of_a_simulated_drive_are_measured_against_its_walls(monkeypatch):
     monkeypatch.setattr(measured, "_SCANS", 12)
     scans = list(measured.extract_scans(World("twins", 3), "field_of_view=360,beams=720,people=2", FEATURES))
     assert len(scans) == 12
-    assert 0.8 < sum(scan.found for scan in scans) / sum(scan.visible_length for scan in scans) <= 1.0
+    assert 0.8 < sum(scan.found_length for scan in scans) / sum(scan.visible_length for scan in scans) <= 1.0
     assert measured.stray_share([scans]) < 0.05
     assert 1.0 < measured.mean_nees([scans]) < 4.0
     assert 0.0 < measured.mean_milliseconds([scans]) < 1000.0

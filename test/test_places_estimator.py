@@ -149,7 +149,7 @@ def test_a_door_that_someone_hid_is_noticed_by_the_turn_into_it(chart, graph, mo
 
 
 def without_sides(openings):
-    """Those that lead ahead alone, as if somebody stood before the others."""
+    """Those that lead ahead alone, as if people hid the others."""
     return Openings(*(field[np.abs(openings.poses[:, 2]) < 0.5] for field in openings))
 
 

@@ -86,7 +86,7 @@ def test_slips_come_as_often_and_are_as_large_as_requested():
 def test_a_log_with_slips_drifts_by_more_than_the_model_says():
     steady, slipping = (open_simulated(f"sim:ring,odometry=0,slips={n}").scenario for n in (0, 10))
     assert np.array_equal(steady.poses, slipping.poses)
-    astray = np.abs(se2.between(steady.odometry[-1], slipping.odometry[-1]))
-    assert astray.max() > 0.1
+    drift = np.abs(se2.between(steady.odometry[-1], slipping.odometry[-1]))
+    assert drift.max() > 0.1
     assert slipping.slips.any()
     assert not steady.slips.any()

@@ -218,7 +218,7 @@ def test_a_robot_that_may_have_stayed_where_much_was_moved_is_nowhere_rather_tha
     assert known.with_false_alarm(np.array([True, False]), 0.5, 4).probabilities[0] > 0.8
 
 
-def test_scans_that_the_map_does_not_hold_are_remembered_as_long_as_they_are_doubtful():
+def test_scans_that_the_map_does_not_hold_are_remembered_as_long_as_they_are_uncertain():
     run, poses = Run(RING), ring_drive(8)
     for pose in poses[:6]:
         run.keyframe(pose)

@@ -124,7 +124,7 @@ def test_in_a_building_that_it_does_not_know_it_stays_lost(office, seed):
     assert all(hypothesis.lost for hypothesis in run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses)
 
 
-def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(office, begin):
+def test_a_robot_that_stands_still_is_localized_at_its_initial_pose(office, begin):
     """In the place of a keyframe; the initial pose is 0.4 m and 6 degrees off."""
     replica = Replica.from_state(office.state.processes["tsbi"].replica)
     hybrid_map = replica.maps[replica.best_hypothesis]

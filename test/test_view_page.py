@@ -144,7 +144,7 @@ def test_the_map_is_sent_to_those_who_do_not_have_it(board, server):
         assert answer.status == 200
 
 
-def test_messages_stream_and_somebody_who_looks_is_noticed(board, server):
+def test_messages_are_streamed_and_viewers_are_counted(board, server):
     assert not board.is_watched
     with urlopen(server.url + "news", timeout=10) as stream:
         assert json.loads(stream.readline().decode().removeprefix("data: "))["history"]["anew"]

@@ -32,7 +32,7 @@ from concept_pictures.canvas import (
 
 
 def registration() -> Figure:
-    """The three ways of laying scans on maps, or on each other."""
+    """The three kinds of registration of scans with maps, or with each other."""
     figure, (field, window, pair) = new_figure(11.0, 3.9, (1.2, 1.0, 1.0))
     walls = np.array(
         [[0, 0, 7, 0], [7, 0, 7, 4], [0, 4, 3, 4], [4.2, 4, 7, 4], [3, 4, 3, 5.2], [4.2, 4, 4.2, 5.2]], dtype=np.float64
@@ -118,7 +118,7 @@ def _draw_pair(axis: Axes) -> None:
 
 
 def lifelong() -> Figure:
-    """What a scan says of places, and what follows for stored scans."""
+    """Change detection: static surfaces, stale beams, and shortened ones."""
     figure, axes = new_figure(10.6, 3.9, (1.0, 1.0, 1.0))
     titles = ("New: static, and in no keyframe", "Stale: the end is seen through", "Shortened: a door closed")
     for axis, title, draw in zip(axes, titles, (_draw_new, _draw_stale, _draw_shortened), strict=True):

@@ -34,7 +34,7 @@ from concept_pictures.canvas import (
 
 
 def areas_and_partition() -> Figure:
-    """Keyframes through two rooms, the overlap of what they see, and the normalized cut that parts them."""
+    """Keyframes through two rooms, their overlap, and the normalized cut that separates them."""
     walls, poses = _two_rooms()
     seen = [rays(pose, walls, 180, 9.0) for pose in poses]
     overlap = _overlaps(seen, 0.2)
@@ -186,7 +186,7 @@ def _least_squares(arcs: Float64, gap: Float64, count: int) -> Float64:
 
 
 def relocalization() -> Figure:
-    """The statistic by which a displacement is noticed, and the states that follow."""
+    """The statistic that detects a kidnapping, and the states of a hypothesis."""
     figure, (statistic, states) = new_figure(10.2, 4.2, (1.15, 1.0))
     generator = np.random.default_rng(3)
     ratio = np.where(np.arange(40) < 24, generator.normal(0.2, 0.6, 40), generator.normal(4.2, 1.0, 40))
