@@ -166,7 +166,7 @@ class Page:
         self._listener.until(due, seconds=120.0, alive=self._nodes)
 
     @property
-    def is_drawn(self):
+    def drawing(self):
         return json.loads(self.browser.evaluate("document.getElementById('plan').dataset.drawn ?? '{}'"))
 
     def text(self, name):

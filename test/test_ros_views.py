@@ -92,8 +92,8 @@ def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(li
     nodes += [start(name) for name in PROCESSES]
     nodes.append(start("robot", log=BUNDLED, robot__rate=0.0))
     if browser is not None:
-        page.until(lambda: page.drawn.get("robot"))
-        early = page.drawn["robot"]
+        page.until(lambda: page.drawing.get("robot"))
+        early = page.drawing["robot"]
     listener.until(lambda: bool(finished), seconds=120.0, alive=nodes)
     # What tlca draws, every 3 s, may be of before the end.
     listener.until(lambda: maps and graphs and groups_of(graphs[-1])["areas"] >= 3, alive=nodes)
@@ -113,10 +113,10 @@ def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(li
         pytest.skip("the topics are well; the page was not looked at, as there is no browser: apt install chromium")
 
     listener.spin(3.5)  # tlca draws every 3 s
-    page.until(lambda: "ended" in page.text("replay") and page.drawn["map"])
-    page.until(lambda: page.drawn["areas"] == groups_of(graphs[-1])["areas"])
+    page.until(lambda: "ended" in page.text("replay") and page.drawing["map"])
+    page.until(lambda: page.drawing["areas"] == groups_of(graphs[-1])["areas"])
     assert_page(page, port, graphs[-1], pmfs[-1])
-    assert page.drawn["robot"] != early
+    assert page.drawing["robot"] != early
     browser.screenshot(screenshots / "desktop.png")
     assert_that_it_answers_clicks(page, snapshot(port)["graph"])
     browser.dark(True)
@@ -169,7 +169,7 @@ def open_before_anything_runs(page, port):
 
 def assert_page(page, port, graph, pmf):
     """The page shows what the topics say."""
-    drawn, known, groups = page.drawn, snapshot(port), groups_of(graph)
+    drawn, known, groups = page.drawing, snapshot(port), groups_of(graph)
     assert drawn["areas"] == groups["areas"]
     assert drawn["arcs"] == groups["arcs"] + groups["closures"]
     assert drawn["closures"] == groups["closures"]
@@ -183,8 +183,8 @@ def assert_page(page, port, graph, pmf):
     assert all(name in page.text("nodes") for name in (*PROCESSES, "robot", "view"))
     assert "samples" in page.text("nodes")
     assert page.text("silent") == "all were heard"
-    assert page.colours("plan") > 50
-    assert page.colours("course") >= 2
+    assert page.colors("plan") > 50
+    assert page.colors("course") >= 2
     assert page.sideways == 0
 
 
@@ -192,31 +192,31 @@ def assert_that_it_answers_clicks(page, graph):
     """A click on an area says how certain its place is; the robot can be followed, and the whole map be seen again."""
     evaluate = page.browser.evaluate
     area = graph["areas"][-1]
-    spot = next(drawn["at"] for drawn in page.drawn["spots"] if drawn["area"] == area["area"])
+    spot = next(drawn["at"] for drawn in page.drawing["spots"] if drawn["area"] == area["area"])
     left, top = evaluate("(({left, top}) => [left, top])(document.getElementById('plan').getBoundingClientRect())")
     page.click(left + spot[0], top + spot[1])
     page.until(lambda: page.text("hint") == area["text"])
     assert "±" in area["text"]
     evaluate("document.getElementById('follow').click()")
-    page.until(lambda: page.drawn["middle"] == page.drawn["robot"][:2])
+    page.until(lambda: page.drawing["middle"] == page.drawing["robot"][:2])
     evaluate("document.getElementById('fit').click()")
-    page.until(lambda: page.drawn["middle"] != page.drawn["robot"][:2])
+    page.until(lambda: page.drawing["middle"] != page.drawing["robot"][:2])
 
 
 def assert_phone(page, screenshots):
     page.browser.size(*PHONE, mobile=True, ratio=2.0)
     page.until(lambda: page.browser.evaluate("document.getElementById('plan').clientWidth") == PHONE[0])
-    page.until(lambda: page.colours("plan") > 50)
+    page.until(lambda: page.colors("plan") > 50)
     assert page.sideways == 0
     page.browser.screenshot(screenshots / "phone.png", whole=True)
-    before = spread(page.drawn["spots"])
+    before = spread(page.drawing["spots"])
     page.pinch(PHONE[0] / 2, 300.0, before=100.0, after=200.0)
-    page.until(lambda: spread(page.drawn["spots"]) == pytest.approx(2.0 * before, rel=0.1))
+    page.until(lambda: spread(page.drawing["spots"]) == pytest.approx(2.0 * before, rel=0.1))
 
 
-def spread(spots):
+def spread(positions):
     """Pixels between the first and the last area."""
-    return np.hypot(*np.subtract(spots[0]["at"], spots[-1]["at"]))
+    return np.hypot(*np.subtract(positions[0]["at"], positions[-1]["at"]))
 
 
 def test_an_arc_that_could_be_any_has_no_ellipse():
