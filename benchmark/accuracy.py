@@ -261,9 +261,7 @@ def plot_errors_by_seed(
             axes.axhline(bounds[name], color="black", linewidth=0.8)
         axes.set_xticks(range(len(final)))
         axes.set_ylim(bottom=0.0)
-        axes.set_title(name)
-        axes.set_xlabel("number of the seed")
-        axes.set_ylabel("mean error of translation [m]")
+        axes.set(title=name, xlabel="number of the seed", ylabel="mean error of translation [m]")
         axes.legend(fontsize=7)
     figure.savefig(path, dpi=_DPI)
 
@@ -286,12 +284,9 @@ def plot_errors_by_span(path: Path, pairs: Mapping[str, Sequence[PairErrors]]) -
             heights = [np.percentile(translation[bins == k], share) for k in filled]
             axes.plot(centers, heights, style, label=f"{share} %")
         axes.axvline(60.0, color="black", linewidth=0.8)
-        axes.set_xscale("log")
-        axes.set_yscale("log")
+        axes.set(xscale="log", yscale="log")
         axes.set_ylim(bottom=1e-3)
-        axes.set_title(name)
-        axes.set_xlabel("time between the two poses [s]")
-        axes.set_ylabel("error of translation [m]")
+        axes.set(title=name, xlabel="time between the two poses [s]", ylabel="error of translation [m]")
         axes.legend(fontsize=7)
     figure.savefig(path, dpi=_DPI)
 

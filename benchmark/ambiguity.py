@@ -12,11 +12,9 @@ from matplotlib.figure import Figure
 
 from benchmark.logs import BUNDLED, open_logs
 from benchmark.report import Report, Requirement, table
-from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings, chosen_seeds, make_records
 from benchmark.simulated.loops import ALIKE_BEAMS, ALIKE_RADIUS, ALIKE_VIEW
 from benchmark.simulated.records import Record
-from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.offline.runtime import run_log
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.recorder import Recorder
@@ -83,7 +81,7 @@ def measure_ambiguity(settings: Settings) -> Report:
     caption = "Effective sample size of the best hypothesis, and probabilities of the robot's place, over time."
     report.pictures["ambiguity.png"] = caption
     report.illustrations = ("ambiguity.png",)
-    particles = load_configuration(PARAMETERS, list(settings.changes)).filter.particles
+    particles = settings.configuration.filter.particles
     plot_ambiguity(settings.out / "ambiguity.png", panels, particles)
     return report
 
@@ -238,7 +236,7 @@ def _cut_panel(pmf: Sequence[Record], moments: Sequence[Moment], marks: dict[str
 def _bundled_panel(settings: Settings) -> dict[str, Panel]:
     """The panel of the first loop of the bundled log; none if no hypothesis closes one."""
     with open_logs([BUNDLED]) as (log,):
-        recorder = run_log(open_log(log.path), load_configuration(PARAMETERS, list(settings.changes))).recorder
+        recorder = run_log(open_log(log.path), settings.configuration).recorder
     pmf = trace_of_recorder(recorder)
     moments = trace_hypotheses(pmf, 0)
     questions = [moment.event for moment in moments if moment.has_question]
@@ -406,8 +404,7 @@ def plot_ambiguity(path: Path, panels: Mapping[str, Panel], particles: int) -> N
         upper, lower = grid[0][column], grid[1][column]
         seconds = [moment.seconds for moment in panel.moments]
         upper.step(seconds, [100.0 * m.samples / particles for m in panel.moments], where="post", color="black")
-        upper.set_ylim(0.0, 105.0)
-        upper.set_ylabel("ESS [%]")
+        upper.set(ylim=(0.0, 105.0), ylabel="ESS [%]")
         upper.set_title(name, fontsize=9)
         for kind, color in _COLORS.items():
             shares = [moment.probabilities[kind] for moment in panel.moments]
@@ -416,8 +413,6 @@ def plot_ambiguity(path: Path, panels: Mapping[str, Panel], particles: int) -> N
             for mark, style in zip(panel.marks.items(), ("--", ":"), strict=False):
                 axes.axvline(mark[1], color="black", linewidth=0.8, linestyle=style, label=mark[0])
         lower.axhspan(LOW, HIGH, color="0.93")
-        lower.set_ylim(-0.02, 1.02)
-        lower.set_ylabel("probability")
-        lower.set_xlabel("time [s]")
+        lower.set(ylim=(-0.02, 1.02), ylabel="probability", xlabel="time [s]")
         lower.legend(fontsize=7)
     figure.savefig(path, dpi=_DPI)

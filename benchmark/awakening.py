@@ -17,11 +17,10 @@ from scipy.spatial import cKDTree
 
 from benchmark.logs import open_logs
 from benchmark.report import Report, Requirement, table
-from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
 from benchmark.simulated.records import Records, code_hash
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs import LogRecord
 from hmt_slam_ros.logs.records import SIMULATION_PREFIX
@@ -118,7 +117,7 @@ class MappedLog:
 def measure_awakening(settings: Settings) -> Report:
     """Map the logs, and localize the robot from starts in them."""
     report = Report("awakening", "Global localization in a saved map", seeds=(0,))
-    configuration = load_configuration(PARAMETERS, list(settings.changes))
+    configuration = settings.configuration
     names = settings.logs_or((*LOGS, *WORLDS))
     rows = []
     with open_logs([name for name in names if name not in WORLDS]) as logs:

@@ -351,13 +351,11 @@ def plot_reliability(path: Path, curves: Mapping[str, Reliability]) -> None:
         upper.plot([0.0, 1.0], [0.0, 1.0], color="black", linewidth=0.8)
         bars = np.maximum(0.0, np.stack((observed - low, high - observed)))
         upper.errorbar(predicted, observed, bars, fmt="o-", capsize=3)
-        upper.set_title(f"{name}: expected error {curve.error:.3f}")
-        upper.set_ylabel("share that is true")
+        upper.set(title=f"{name}: expected error {curve.error:.3f}", ylabel="share that is true")
         lower.bar(predicted, counts, width=0.04)
         lower.set_yscale("log")
         lower.set_xlim(upper.get_xlim())
-        lower.set_xlabel("probability")
-        lower.set_ylabel("answers")
+        lower.set(xlabel="probability", ylabel="answers")
     figure.savefig(path, dpi=_DPI)
 
 
@@ -384,9 +382,6 @@ def plot_nees(path: Path, samples: Mapping[str, Sequence[float]]) -> None:
     axes.plot(
         errors, gammainc(1.5, 0.5 * errors), color="black", linewidth=0.8, label="chi-square, 3 degrees of freedom"
     )
-    axes.set_xscale("log")
-    axes.set_xlim(0.01, 100.0)
-    axes.set_xlabel("NEES")
-    axes.set_ylabel("share of errors below")
+    axes.set(xscale="log", xlim=(0.01, 100.0), xlabel="NEES", ylabel="share of errors below")
     axes.legend(fontsize=7)
     figure.savefig(path, dpi=_DPI)

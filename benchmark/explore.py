@@ -11,10 +11,9 @@ import numpy as np
 from benchmark.driven_run import DrivenRun, true_place
 from benchmark.institute_maps import NEAR, PEOPLE, ChartScores, chart_map, scenario_of, score_chart
 from benchmark.report import Columns, Report, Requirement, mean, table_of
-from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings, chosen_seeds
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.exploration.explorer import Explorer
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
@@ -93,7 +92,7 @@ class RoomMission(NamedTuple):
 def measure_explore(settings: Settings) -> Report:
     """Explore institutes, and drive missions in them."""
     seeds = chosen_seeds(settings, SEEDS)
-    configuration = load_configuration(PARAMETERS, list(settings.changes))
+    configuration = settings.configuration
     explorations: list[Exploration] = []
     missions: dict[str, list[RoomMission]] = {}
     for seed in seeds:

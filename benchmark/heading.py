@@ -1,4 +1,4 @@
-"""Heading estimates from lines along simulated drives, compared with the truth."""
+"""Simulated drives: keyframes, depths in rooms, and heading estimates from lines compared with the truth."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from benchmark.line_truth import true_lines
+from benchmark.lines import true_lines
 from benchmark.simulated.worlds import World
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.landmarks.heading import QUARTER_TURN, BuildingHeading
@@ -22,7 +22,7 @@ _TIMES = 400  # in a drive at which the heading is compared
 _SAME = 1e-6  # rad
 
 
-def heading_errors(world: World, laser: str, configuration: Configuration) -> NDArray[np.float64]:
+def heading_errors(world: World, laser: str, configuration: Configuration) -> Float64:
     """Error of the filter, its deviation, error of odometry (rad) and number of lines along a drive, shape (n, 4)."""
     scenario = open_simulated(",".join(filter(None, (world.log, laser)))).scenario
     features = replace(configuration.features, range_deviation=scenario.settings.range_noise)
@@ -50,3 +50,23 @@ def _wall_direction(scenario: Scenario) -> float:
     alphas = true_lines(scenario, int(scenario.scan_stamps[0]), np.zeros(3))[:, 0] % QUARTER_TURN
     apart = np.abs(alphas[:, None] - alphas[None, :])
     return float(alphas[np.argmax((np.minimum(apart, QUARTER_TURN - apart) < _SAME).sum(axis=1))])
+
+
+def keyframes_of(poses: Float64, configuration: Configuration) -> list[int]:
+    """Numbers of the scans of a drive that are keyframes, by the distances of metric SLAM."""
+    options, found = configuration.filter, [0]
+    for k in range(1, len(poses)):
+        away = se2.between(poses[found[-1]], poses[k])
+        turned = abs(away[2]) > math.radians(options.keyframe_angle)
+        if turned or math.hypot(away[0], away[1]) > options.keyframe_distance:
+            found.append(k)
+    return found
+
+
+def depth_in_rooms(scenario: Scenario, poses: Float64) -> Float64:
+    """How deep poses (n, 3) are in a room, m, shape (n,); below 0 for those outside of all, by the distance."""
+    deepest = np.full(len(poses), -np.inf)
+    for room in scenario.building.rooms:
+        local = np.abs(se2.transform(se2.inverse(room[:3]), poses[:, :2]))
+        deepest = np.maximum(deepest, (0.5 * room[3:] - local).min(axis=1))
+    return deepest

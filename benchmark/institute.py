@@ -22,9 +22,8 @@ from benchmark.institute_drives import (
 )
 from benchmark.institute_maps import PEOPLE, map_institute, scenario_of
 from benchmark.report import Report, Requirement, mean, table
-from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings, chosen_seeds
-from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.configuration import Configuration
 
 SEEDS = 5
 """Buildings."""
@@ -59,7 +58,7 @@ POLICY = (
 def measure_institute(settings: Settings) -> Report:
     """Drive missions, and relocate lost robots."""
     seeds = chosen_seeds(settings, SEEDS)
-    configuration = load_configuration(PARAMETERS, list(settings.changes))
+    configuration = settings.configuration
     with ProcessPoolExecutor(settings.records.jobs) as pool:
         buildings = list(pool.map(partial(_measure_building, configuration=configuration), seeds))
     missions = {name: [mission for building in buildings for mission in building[name][0]] for name in _CHANGED}

@@ -8,13 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation.building import furniture_walls
 from hmt_slam_ros.simulation.laser import WallIndex, has_line_of_sight, wall_index
 from hmt_slam_ros.simulation.scenario import Scenario
-
-Array = NDArray[np.float64]
 
 REACH = 6.0
 """Landmarks farther away, m, do not have to be found."""
@@ -40,8 +39,8 @@ class TrueLandmarks(NamedTuple):
     :ivar due: shape (n,), whether enough of it is visible that it has to be found.
     """
 
-    poses: Array
-    kinds: Array
+    poses: Float64
+    kinds: Float64
     due: NDArray[np.bool_]
 
 
@@ -51,7 +50,7 @@ _NOTHING = TrueLandmarks(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.bool_))
 class Surroundings:
     """Walls, panels of closed doors and furniture around the robot, in its frame."""
 
-    def __init__(self, scenario: Scenario, stamp: int, pose: Array) -> None:
+    def __init__(self, scenario: Scenario, stamp: int, pose: Float64) -> None:
         building = scenario.building.walls
         everything = np.concatenate((building, furniture_walls(scenario.furniture(stamp))))
         is_panel = (building[:, None] == scenario.building.doors[None]).all(axis=2).any(axis=1)
@@ -59,7 +58,7 @@ class Surroundings:
         self.surfaces = _to_frame(everything, pose)
         self.index: WallIndex = wall_index(self.surfaces)
 
-    def is_visible(self, points: Array) -> NDArray[np.bool_]:
+    def is_visible(self, points: Float64) -> NDArray[np.bool_]:
         """Which points (..., 2) are visible from the robot, shape (...)."""
         flat = np.ascontiguousarray(points.reshape(-1, 2))
         visible: NDArray[np.bool_] = has_line_of_sight(self.index, np.zeros_like(flat), flat)
@@ -98,7 +97,7 @@ class Surroundings:
             found.append(TrueLandmarks(poses[visible], np.full(visible.sum(), float(side < 0.0)), due[visible]))
         return _concatenate(found)
 
-    def _is_shown(self, at: Array, along: Array, beside: Array, length: float) -> NDArray[np.bool_]:
+    def _is_shown(self, at: Float64, along: Float64, beside: Float64, length: float) -> NDArray[np.bool_]:
         """Whether a stretch of a surface is visible under a sufficient angle."""
         places = np.linspace(0.05, length, 8)
         points = at[:, None] + places[:, None] * along[:, None] + _BESIDE * beside[:, None]
@@ -114,7 +113,7 @@ class Surroundings:
         gaps = [gap for end, unit in zip(ends, units, strict=True) if (gap := self._gap(end, unit, features))]
         return _without_repetitions(_concatenate([_NOTHING, *gaps]))
 
-    def _gap(self, end: Array, along: Array, features: FeatureParameters) -> TrueLandmarks | None:
+    def _gap(self, end: Float64, along: Float64, features: FeatureParameters) -> TrueLandmarks | None:
         """The opening that begins at the end of a wall, None without one."""
         normal = np.array([-along[1], along[0]]) * (1.0 if along[0] * end[1] - along[1] * end[0] > 0.0 else -1.0)
         width, wall = self._next_on_line(end, along, normal)
@@ -137,7 +136,7 @@ class Surroundings:
         pose = np.array([[*middle, math.atan2(normal[1], normal[0])]])
         return TrueLandmarks(pose, np.array([width]), np.array([due]))
 
-    def _next_on_line(self, end: Array, along: Array, normal: Array) -> tuple[float, bool]:
+    def _next_on_line(self, end: Float64, along: Float64, normal: Float64) -> tuple[float, bool]:
         """Distance from the end of a wall to the next surface on its line, m, and whether that is a wall."""
         ends = self.building.reshape(-1, 2, 2) - end
         at, off = ends @ along, ends @ normal
@@ -149,7 +148,7 @@ class Surroundings:
         first = [part[part > _ON].min(initial=np.inf) for part in (collinear, crossed)]
         return float(min(first)), bool(first[0] <= first[1] + _ON)
 
-    def _is_closed(self, before: Array, behind: Array) -> bool:
+    def _is_closed(self, before: Float64, behind: Float64) -> bool:
         """Whether a door panel is between two points."""
         ends, way = self._door_panels.reshape(-1, 2, 2) - before, behind - before
         sides = ends[..., 1] * way[0] - ends[..., 0] * way[1]
@@ -159,7 +158,7 @@ class Surroundings:
         crossing_share = (a + share[:, None] * (b - a)) @ way / (way @ way)
         return bool(((crossing_share > 0.0) & (crossing_share < 1.0)).any())
 
-    def is_free(self, points: Array) -> NDArray[np.bool_]:
+    def is_free(self, points: Float64) -> NDArray[np.bool_]:
         """Which points (n, 2) are on the free side of the walls, (n,): rays from there cross an odd number of walls."""
         a, b = self.building[None, :, :2] - points[:, None], self.building[None, :, 2:] - points[:, None]
         # Rays have a slant that no wall has.
@@ -171,18 +170,18 @@ class Surroundings:
         return np.asarray((over & (x > 0.0)).sum(axis=1) % 2 == 1)
 
 
-def _to_frame(walls: Array, pose: Array) -> Array:
+def _to_frame(walls: Float64, pose: Float64) -> Float64:
     """Walls (n, 4) in the frame of a pose (3,)."""
     return se2.transform(se2.inverse(pose), walls.reshape(-1, 2)).reshape(-1, 4)
 
 
-def _directions(walls: Array) -> Array:
+def _directions(walls: Float64) -> Float64:
     """Unit vectors (n, 2) along walls (n, 4)."""
     away = walls[:, 2:] - walls[:, :2]
     return np.asarray(away / np.linalg.norm(away, axis=1)[:, None])
 
 
-def _arm_lengths(at: Array, walls: Array, along: Array, gap: float) -> Array:
+def _arm_lengths(at: Float64, walls: Float64, along: Float64, gap: float) -> Float64:
     """Lengths of walls (n, 4) from points (n, 2) on, m; 0 for those that begin beyond the gap."""
     ends = np.stack([((walls[:, k : k + 2] - at) * along).sum(axis=1) for k in (0, 2)], axis=1)
     return np.where(ends.min(axis=1) <= gap, ends.max(axis=1), 0.0)
@@ -205,7 +204,7 @@ def _without_repetitions(truth: TrueLandmarks) -> TrueLandmarks:
     return TrueLandmarks(truth.poses[kept], truth.kinds[kept], truth.due[kept])
 
 
-def are_near(poses: Array, pose: Array, distance: float, turn: float) -> NDArray[np.bool_]:
+def are_near(poses: Float64, pose: Float64, distance: float, turn: float) -> NDArray[np.bool_]:
     """Which poses (n, 3) are within a distance, m, and an angle, rad, of another (3,)."""
     near = np.hypot(*(poses[:, :2] - pose[:2]).T) <= distance
     return np.asarray(near & (np.abs(se2.wrap(poses[:, 2] - pose[2])) <= turn))

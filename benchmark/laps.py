@@ -14,9 +14,8 @@ from pathlib import Path
 from benchmark.charted_run import resident_bytes
 from benchmark.logs import open_logs
 from benchmark.report import Report, Requirement, table
-from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
-from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.evaluation import (
     Relations,
     StampedPoses,
@@ -104,7 +103,7 @@ class Laps:
 def measure_laps(settings: Settings) -> Report:
     """Drive the laps, and compare the last with the first."""
     report = Report("laps", "Repeated laps on known ground", seeds=(0,))
-    configuration = load_configuration(PARAMETERS, list(settings.changes))
+    configuration = settings.configuration
     names = settings.logs_or((*WORLDS, *LOGS))
     with open_logs([name for name in names if name not in WORLDS]) as logs:
         jobs: dict[str, tuple[str, Path | None, int]] = {

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmark.line_truth import true_scan
-from benchmark.lines import walls_of
+from benchmark.lines import true_scan, walls_of
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.landmarks.line_extraction import extract_for_map

@@ -137,7 +137,7 @@ def measure_oracle(settings: Settings) -> Report:
     """Enumerate and compare."""
     seeds = settings.seeds_or(SEEDS)
     report = Report("oracle", "TSBI against exact enumeration", seeds=seeds)
-    usual = load_configuration(PARAMETERS, list(settings.changes)).tsbi.max_hypotheses
+    usual = settings.configuration.tsbi.max_hypotheses
     rows, pictured = [], {}
     for regime in REGIMES:
         drives = [
@@ -425,7 +425,6 @@ def plot_oracle(path: Path, distances: Mapping[str, Mapping[int, float]], bound:
         axes.plot(list(own), list(own.values()), "o-", label=name)
     axes.axhline(bound, color="black", linewidth=0.8)
     axes.set_xscale("log", base=2)
-    axes.set_xlabel("hypotheses")
-    axes.set_ylabel("mean total variation distance")
+    axes.set(xlabel="hypotheses", ylabel="mean total variation distance")
     axes.legend(fontsize=7)
     figure.savefig(path, dpi=_DPI)

@@ -22,10 +22,9 @@ from benchmark.institute_maps import LASER, PEOPLE, chart_map, scenario_of
 from benchmark.live import PROCESSES
 from benchmark.report import Columns, Report, Requirement, mean, table_of
 from benchmark.running_nodes import Listener, Parameters
-from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings, chosen_seeds
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import Explorer
 from hmt_slam_ros.exploration.rooms import named_destinations
@@ -103,7 +102,7 @@ class TaskScore(NamedTuple):
 def measure_pilot(settings: Settings) -> Report:
     """Explore, save the maps, and send the pilot to rooms."""
     seeds = chosen_seeds(settings, SEEDS)
-    configuration = load_configuration(PARAMETERS, list(settings.changes))
+    configuration = settings.configuration
     explore = partial(explore_building, configuration=configuration, out=settings.out)
     with ProcessPoolExecutor(settings.records.jobs) as pool:
         buildings = list(pool.map(explore, seeds))

@@ -85,7 +85,7 @@ _DPI = 110
 
 def measure_scale(settings: Settings) -> Report:
     """Measure times of cuts, scans and files, and the memory of an area."""
-    configuration = load_configuration(PARAMETERS, list(settings.changes))
+    configuration = settings.configuration
     report = Report("scale", "Cost against the number of areas", seeds=(0,))
     cuts = {lattice.areas: measured_cuts(lattice, configuration) for lattice in (*SMALL, *LARGE)}
     report.requirements += [cut_requirement(areas, cuts[areas]) for areas in CUT_BOUNDS]
@@ -353,8 +353,6 @@ def plot_scale(
         right.plot(list(scans), [own[process] for own in scans.values()], "o-", label=process)
     right.set_ylabel("time of a scan [ms]")
     for axes in (left, right):
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xlabel("areas")
+        axes.set(xscale="log", yscale="log", xlabel="areas")
         axes.legend(fontsize=7)
     figure.savefig(path, dpi=_DPI)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmark.runs import Runner
+from benchmark.runs import PARAMETERS, Runner
 from benchmark.simulated.records import Record, Records
 from benchmark.simulated.worlds import FAMILIES, World, seeds
+from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 
 SEEDS = 40
@@ -38,6 +39,11 @@ class Settings:
     records: Records
     training: bool = False
     minutes: float = 60.0
+
+    @property
+    def configuration(self) -> Configuration:
+        """The configuration of the parameter file, with the changes."""
+        return load_configuration(PARAMETERS, list(self.changes))
 
     def logs_or(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """The selected logs, by default ``names``."""

@@ -344,13 +344,10 @@ def plot_growth(path: Path, logs: Mapping[str, Mapping[str, Mapping[str, Any]]])
             minutes = [sample["s"] / 60.0 for sample in memory]
             upper.plot(minutes, [(s["bytes"] - memory[0]["bytes"]) / 1e6 for s in memory], label=method)
             lower.plot([sample["s"] / 60.0 for sample in cost], [sample["ms"] for sample in cost], linewidth=0.8)
-        upper.set_title(name)
-        upper.set_ylabel("memory [MB]")
+        upper.set(title=name, ylabel="memory [MB]")
         upper.set_ylim(bottom=0.0)
         upper.legend(fontsize=7)
-        lower.set_yscale("log")
-        lower.set_ylabel("computing time of a scan [ms]")
-        lower.set_xlabel("time of the log [min]")
+        lower.set(yscale="log", ylabel="computing time of a scan [ms]", xlabel="time of the log [min]")
     figure.savefig(path, dpi=_DPI)
 
 
@@ -367,7 +364,6 @@ def plot_processes(path: Path, logs: Mapping[str, Mapping[str, float]]) -> None:
         places = np.arange(len(processes)) + (k - 0.5 * (len(logs) - 1)) * width
         axes.bar(places, [own[process] for process in processes], width, label=name)
     axes.set_xticks(range(len(processes)), processes)
-    axes.set_yscale("log")
-    axes.set_ylabel("mean time for a scan [ms]")
+    axes.set(yscale="log", ylabel="mean time for a scan [ms]")
     axes.legend(fontsize=7)
     figure.savefig(path, dpi=_DPI)

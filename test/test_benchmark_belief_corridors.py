@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmark.belief_corridors import draw_building, random_corridors
+from benchmark.belief_world import draw_building, random_corridors
 
 
 def test_a_building_has_what_its_map_has_where_that_is_certain_and_less_where_it_is_not():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worlds import box, drive, scan_at, scan_in
 
-from benchmark.hallways import depth_in_rooms
+from benchmark.heading import depth_in_rooms
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.landmarks.area_classes import (

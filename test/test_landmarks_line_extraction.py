@@ -7,7 +7,7 @@ import pytest
 from worlds import box, scan_at, scan_in
 
 from benchmark import lines as measured
-from benchmark.line_truth import line_difference, lines_of, true_scan
+from benchmark.lines import line_difference, lines_of, true_scan
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmark.belief_corridors import Corridors, draw_building, random_corridors
-from benchmark.belief_world import draw_of_present
+from benchmark.belief_world import Corridors, draw_building, draw_of_present, random_corridors
 from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
 from hmt_slam_ros.places.loop_detector import TwoPeakTracker, initial_loop_belief
 from hmt_slam_ros.places.observation import observation_model

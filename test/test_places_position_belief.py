@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmark.belief_corridors import random_corridors
-from benchmark.belief_world import draw_clutter, draw_observation
+from benchmark.belief_world import draw_clutter, draw_observation, random_corridors
 from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
 from hmt_slam_ros.places.observation import log_observation_ratios, log_unknown_ground_ratio, observation_model
 from hmt_slam_ros.places.observation_graph import LandmarkSequence, empty_sequence, merge_sequences

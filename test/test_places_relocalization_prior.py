@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmark.landmark_scans import keyframes_of
+from benchmark.heading import keyframes_of
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian

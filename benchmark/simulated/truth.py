@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from benchmark.landmark_truth import Surroundings
 from hmt_slam_ros.area_abstraction.doors import MAX_STEP, find_crossings
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -28,7 +29,7 @@ from hmt_slam_ros.simulation import SimulatedLog
 from hmt_slam_ros.simulation.building import Building
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
-Pose = NDArray[np.float64]
+Pose = Float64
 
 RADIUS = 2.0
 """Largest distance of keyframes in the same place, which also see each other, m: ``tsbi.place_radius``."""
@@ -44,7 +45,6 @@ _ADMITTED = 16.27  # chi-square with 3 degrees of freedom at 99.9 %
 # Covariance of keyframes within their areas, which is not part of that of a placement: m, m, rad.
 _WITHIN_AREAS = np.diag([0.1, 0.1, np.radians(1.0)]) ** 2
 
-Array = NDArray[np.float64]
 
 # Largest distance of keyframes that see a portal, m.
 _AROUND = 2.0
@@ -97,7 +97,7 @@ class Truth:
         """Which of n keyframes are in the same place as which of m others, shape (n, m)."""
         return self.log.same_place(self._stamps(keyframes), self._stamps(others), radius)
 
-    def shared_view(self, keyframe: int, others: Sequence[int]) -> NDArray[np.float64]:
+    def shared_view(self, keyframe: int, others: Sequence[int]) -> Float64:
         """Share of a keyframe's view that each of the others has too, shape (m,), from 0 to 1."""
         shares = self.log.shared_view(self._stamps([keyframe]), self._stamps(others))
         return np.asarray(shares[0], dtype=np.float64)
@@ -113,7 +113,7 @@ class Truth:
         return se2.compose(self.poses[first], se2.inverse(poses[first]))
 
     def assess(
-        self, known: Mapping[int, Pose], query: Mapping[int, Pose], covariance: NDArray[np.float64], origin: Pose
+        self, known: Mapping[int, Pose], query: Mapping[int, Pose], covariance: Float64, origin: Pose
     ) -> PlacementError:
         """The error of a placement of keyframes in a known area.
 
@@ -173,18 +173,18 @@ class Doors(NamedTuple):
     :ivar halves: shape (n,), distance from there to the border of a crossing, m; 0 for a door.
     """
 
-    poses: Array
-    widths: Array
-    middles: Array
-    halves: Array
+    poses: Float64
+    widths: Float64
+    middles: Float64
+    halves: Float64
 
-    def select_passed(self, path: Array) -> Doors:
+    def select_passed(self, path: Float64) -> Doors:
         """The openings that a path (n, 2) passes."""
         openings = zip(self.poses, self.widths, strict=True)
         chosen = np.array([any(find_crossings(path, *opening)) for opening in openings], dtype=np.bool_)
         return Doors(*(column[chosen] for column in self))
 
-    def distances(self, places: Array) -> Array:
+    def distances(self, places: Float64) -> Float64:
         """Distances (n, m) of places (m, 2) from them, m."""
         away = np.hypot(*(self.middles[:, None] - places[None]).transpose(2, 0, 1))
         return np.asarray(np.maximum(0.0, away - self.halves[:, None]))
@@ -230,7 +230,7 @@ def score_openings(
     }
 
 
-def _area_changes(truth: Truth, hybrid_map: HybridMap) -> Array:
+def _area_changes(truth: Truth, hybrid_map: HybridMap) -> Float64:
     """True positions (n, 2) of area changes along the path, each between two keyframes."""
     path = sorted((k, area) for area in hybrid_map.area_ids() for k in hybrid_map.keyframes(area))
     ends = [(truth.poses[a][:2], truth.poses[b][:2]) for (a, left), (b, entered) in pairwise(path) if left != entered]
@@ -239,7 +239,7 @@ def _area_changes(truth: Truth, hybrid_map: HybridMap) -> Array:
 
 def _portal_places(
     truth: Truth, hybrid_map: HybridMap, scans: Mapping[int, Scan], configuration: Configuration
-) -> Array:
+) -> Float64:
     """Positions (n, 2) of the portals in the world, by the true frame of their first area."""
     known, landmarks = AreaLandmarkExtractor(LocalMapping(configuration)), {}
     for area in hybrid_map.area_ids():
@@ -251,7 +251,7 @@ def _portal_places(
     return np.array(portal_poses).reshape(-1, 3)[:, :2]
 
 
-def _distance_from_gap(truth: Truth, place: Array, configuration: Configuration) -> float:
+def _distance_from_gap(truth: Truth, place: Float64, configuration: Configuration) -> float:
     """Distance of a position (2,) from the nearest gap between walls that keyframes around see, m."""
     least = math.inf
     for k, pose in truth.poses.items():
