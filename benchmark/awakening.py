@@ -176,7 +176,7 @@ def map_log(path: Path | str, configuration: Configuration) -> dict[str, MappedL
     known_scans, poses = np.array(list(pose_of_scan)), np.array(list(pose_of_scan.values()))
     distances, nearest = cKDTree(truth[known_scans, :2]).query(truth[:, :2])
     in_half = se2.compose(poses[nearest], se2.between(truth[known_scans[nearest]], truth))
-    travel = np.array(list(path_lengths(truth)))
+    travel = np.array(list(_path_lengths(truth)))
     ends = np.searchsorted(travel, travel + _HELD_WAY)
     starts_in_half = [n for n in range(middle, last) if (distances[n : ends[n]] <= _HELD).all()]
     easy = MappedLog(configuration, records, whole, scans, truth, range(last))
@@ -203,7 +203,7 @@ def _keyframes(state: RunState) -> dict[int, Float64]:
     }
 
 
-def path_lengths(poses: Float64) -> Iterator[float]:
+def _path_lengths(poses: Float64) -> Iterator[float]:
     """Path length up to each of the poses (n, 3), m."""
     total, last = 0.0, poses[0]
     for pose in poses:
@@ -266,7 +266,7 @@ def try_start(log: MappedLog, start: int) -> Awakening:
     run = LockStepRun(log.configuration, state=log.state)
     run.lock_step.feed(PoseReset())
     found, right, wrong = math.inf, False, False
-    travel, first = path_lengths(log.truth[start:]), int(log.scans[start])
+    travel, first = _path_lengths(log.truth[start:]), int(log.scans[start])
     counted, n = -_STEP, start
     for record in log.records[first:]:
         run.process_record(record)

@@ -28,9 +28,9 @@ SURENESS = 2.0
 WIDTHS = (0.6, 3.0)
 """Of openings, m, evenly distributed."""
 
-
 ROUGH = 0.03
 """Deviation of a distance in the map by its length."""
+
 _DOOR, _HALLWAY = (0.7, 1.2), (1.5, 2.5)  # widths, m
 _DOORS, _LEAST = 3.0, 1.5  # mean distance between doors beyond the least, m
 _BETWEEN, _END = (10.0, 20.0), (6.0, 15.0)  # of hallways from each other and beyond the last crossing, m

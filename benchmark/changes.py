@@ -282,19 +282,19 @@ def _frame(recording: Recording, first: SimulatedLog) -> NDArray[np.float64]:
 
 def _is_same_map(before: RunState, after: RunState) -> bool:
     """Whether another state contains the best map of a state unchanged."""
-    one, other = (Replica.from_state(state.processes["slam"].replica) for state in (before, after))
-    old_map, new_map = one.maps[one.best_hypothesis], other.maps[other.best_hypothesis]
+    old_replica, new_replica = (Replica.from_state(state.processes["slam"].replica) for state in (before, after))
+    old_map, new_map = old_replica.maps[old_replica.best_hypothesis], new_replica.maps[new_replica.best_hypothesis]
     areas = old_map.area_ids()
     arcs = {(a, b): arc for a, b, arc in new_map.all_arcs()}
     return (
         all(_are_equal(old_map.keyframes(area), new_map.keyframes(area)) for area in areas)
         and all(_are_equal({0: arc.pose.mean}, {0: arcs[a, b].pose.mean}) for a, b, arc in old_map.all_arcs())
-        and all(one.scans[k] is other.scans[k] for area in areas for k in old_map.keyframes(area))
+        and all(old_replica.scans[k] is new_replica.scans[k] for area in areas for k in old_map.keyframes(area))
     )
 
 
-def _are_equal(one: Mapping[int, NDArray[np.float64]], other: Mapping[int, NDArray[np.float64]]) -> bool:
-    return one.keys() == other.keys() and all((one[k] == other[k]).all() for k in one)
+def _are_equal(poses: Mapping[int, NDArray[np.float64]], other_poses: Mapping[int, NDArray[np.float64]]) -> bool:
+    return poses.keys() == other_poses.keys() and all((poses[k] == other_poses[k]).all() for k in poses)
 
 
 def _describe_localization(name: str, seeds: Sequence[int], localized: Sequence[LocalizationVisit]) -> str:

@@ -22,8 +22,6 @@ from hmt_slam_ros.simulation.building import furniture_walls
 from hmt_slam_ros.simulation.scenario import Scenario
 
 _SCANS = 60  # of every drive
-
-
 _ON = 1e-4  # largest distance of a hit from its wall, m
 _DECIMALS = 6  # of radians and meters, to which walls on one line agree
 

@@ -64,10 +64,13 @@ def measure_structure(settings: Settings) -> Report:
     ]
     report.body = [
         table(["modules", "lines", "classes"], [[str(len(paths)), str(sum(lines.values())), str(classes.total())]]),
-        table(["of one", "files", "moves"], [[kind, str(one.files), str(one.moves)] for kind, one in figures.items()]),
+        table(
+            ["of one", "files", "moves"],
+            [[kind, str(passage.files), str(passage.moves)] for kind, passage in figures.items()],
+        ),
         f"Several meanings: {', '.join(homonyms) or 'none'}.",
     ]
-    report.data = {kind: one._asdict() for kind, one in figures.items()}
+    report.data = {kind: passage._asdict() for kind, passage in figures.items()}
     return report
 
 
@@ -80,9 +83,9 @@ def class_names(path: Path) -> Iterator[str]:
 
 def typical_passage(passages: list[Passage], kind: str) -> Passage:
     """The median of a kind's passages; of closures, the largest."""
-    own = [one for one in passages if one.kind == kind]
+    own = [passage for passage in passages if passage.kind == kind]
     over: Callable[[list[int]], float] = max if kind == "closure" else statistics.median
-    files, moves = ([getattr(one, name) for one in own] or [0] for name in ("files", "moves"))
+    files, moves = ([getattr(passage, name) for passage in own] or [0] for name in ("files", "moves"))
     return Passage(kind, round(over(files)), round(over(moves)))
 
 

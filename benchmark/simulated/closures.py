@@ -99,8 +99,8 @@ class Paths:
         recent_poses = {
             k: se2.compose(pose.mean, at) for k, at in before.keyframes(other).items() if k in recent_keyframes
         }
-        known, examinations = before.keyframes(known_area), moved_keyframes or recent_poses
-        assessment = self._truth.assess(known, examinations, pose.covariance, pose.mean)
+        known, query = before.keyframes(known_area), moved_keyframes or recent_poses
+        assessment = self._truth.assess(known, query, pose.covariance, pose.mean)
         way = examination.kind if examination else "tracked"
         return Closure(event, way, (other, known_area), assessment)
 
@@ -113,13 +113,13 @@ class Paths:
     def _reassess(self, closure: Closure, chosen: HybridMap) -> Closure:
         """The closure with its current error by the same keyframes; unchanged if one of them left the two areas."""
         other, known_area = closure.areas
-        known, examinations = closure.assessment.pair
+        known, query = closure.assessment.pair
         pose = chosen.arc(known_area, other)
         ours, theirs = chosen.keyframes(known_area), chosen.keyframes(other)
-        if pose is None or known not in ours or examinations not in {*ours, *theirs}:
+        if pose is None or known not in ours or query not in {*ours, *theirs}:
             return closure
-        at = ours[examinations] if examinations in ours else se2.compose(pose.mean, theirs[examinations])
-        assessment = self._truth.assess({known: ours[known]}, {examinations: at}, pose.covariance, pose.mean)
+        at = ours[query] if query in ours else se2.compose(pose.mean, theirs[query])
+        assessment = self._truth.assess({known: ours[known]}, {query: at}, pose.covariance, pose.mean)
         return replace(closure, assessment=assessment)
 
 

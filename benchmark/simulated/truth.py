@@ -247,7 +247,7 @@ def _portal_places(
         landmarks[area] = known.extract([scans[k] for k in poses], np.array(list(poses.values())).reshape(-1, 3))
     portals = find_portals(hybrid_map, landmarks, configuration.features)
     frames = [truth.frame(hybrid_map, portal.areas[0]) for portal in portals]
-    portal_poses = [se2.compose(frame, one.pose_in_a.mean) for frame, one in zip(frames, portals, strict=True)]
+    portal_poses = [se2.compose(frame, portal.pose_in_a.mean) for frame, portal in zip(frames, portals, strict=True)]
     return np.array(portal_poses).reshape(-1, 3)[:, :2]
 
 

@@ -91,9 +91,9 @@ def _two_rooms() -> tuple[Float64, Float64]:
 def _overlaps(seen: Sequence[Float64], radius: float) -> Float64:
     """Mean of the two shares of points that have one of the other scan near, shape (n, n), zero diagonal."""
     found = np.zeros((len(seen), len(seen)))
-    for i, one in enumerate(seen):
+    for i, scan in enumerate(seen):
         for j in range(i):
-            near = np.hypot(*(one[:, None] - seen[j][None]).transpose(2, 0, 1)) <= radius
+            near = np.hypot(*(scan[:, None] - seen[j][None]).transpose(2, 0, 1)) <= radius
             found[i, j] = found[j, i] = 0.5 * (near.any(axis=1).mean() + near.any(axis=0).mean())
     return found
 
