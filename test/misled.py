@@ -18,7 +18,7 @@ from hmt_slam_ros.topological_inference.tsbi import Tsbi
 SIGMA = np.diag([0.05, 0.05, np.radians(0.5)]) ** 2
 
 
-def misled(area, known, deviations):
+def make_misled(area, known, deviations):
     """What makes the children of hypotheses, once falsely: from ``area`` a loop is closed to ``known``.
 
     :param deviations: error of the place in deviations of the arcs' belief, in its worst direction.
