@@ -116,7 +116,7 @@ def _within_reach(landmarks: LandmarkSequence, positions: Float64, places: Place
 
 def select_landmarks(landmarks: LandmarkSequence, rows: Bool | Int64 | slice) -> LandmarkSequence:
     """The landmarks of some rows."""
-    return LandmarkSequence(*(column[rows] for column in landmarks))
+    return LandmarkSequence._make(column[rows] for column in landmarks)
 
 
 def concatenate_sequences(sequences: Sequence[LandmarkSequence]) -> LandmarkSequence:
