@@ -106,7 +106,7 @@ def _documented_constants(module: ast.Module) -> Iterator[tuple[str, str, str]]:
     """Name, value and meaning of the numbers of a module that a sentence follows."""
     for node, following in pairwise(module.body):
         if isinstance(node, ast.Assign) and isinstance(following, ast.Expr):
-            name, value = _unparenthesized(node.targets[0]), _unparenthesized(node.value)
+            name, value = _strip_parentheses(node.targets[0]), _strip_parentheses(node.value)
             if name.isupper() and re.search(r"\d", value) and not _NO_NUMBER.search(f"{name} = {value}"):
                 meaning = " ".join(ast.literal_eval(following.value).split())
                 meaning = re.sub(r":[a-z]+:`~?([^`]*)`", r"`\1`", meaning).replace("``", "`")
@@ -117,7 +117,7 @@ _NO_NUMBER = re.compile(r"^NO_|= range\(|zeros\(|[\"']")
 """Empty values, enumerations and texts."""
 
 
-def _unparenthesized(node: ast.expr) -> str:
+def _strip_parentheses(node: ast.expr) -> str:
     return ", ".join(map(ast.unparse, node.elts)) if isinstance(node, ast.Tuple) else ast.unparse(node)
 
 

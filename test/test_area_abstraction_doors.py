@@ -17,7 +17,7 @@ BLIND = Rays(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.ze
 DOOR, OTHER = (3.2, 0.0, 0.0), (6.2, 0.0, 0.0)
 
 
-def shown(pose, openings, confidence=0.9, kind=OPENING):
+def landmark_openings(pose, openings, confidence=0.9, kind=OPENING):
     """The openings that a keyframe shows, as landmarks with beams without returns."""
     poses = np.array([se2.between(pose, np.array(one)) for one in openings]).reshape(-1, 3)
     count = len(poses)
@@ -32,7 +32,7 @@ def go(way, xs, openings, first=0, y=0.0, **how):
     for event, x in enumerate(xs, start=first):
         pose = np.array([x, y, 0.0])
         near = [one for one in openings if 0.0 < (one[0] - x) * np.cos(one[2]) < 2.0]
-        way = way.update(event, PoseGaussian(pose, np.eye(3) * 1e-4), shown(pose, near, **how))
+        way = way.update(event, PoseGaussian(pose, np.eye(3) * 1e-4), landmark_openings(pose, near, **how))
     return way
 
 
@@ -83,7 +83,7 @@ def test_a_tracker_in_another_frame():
     way = go(DoorTracker(), 0.5 * np.arange(6), [DOOR]).transform(frame)
     for event, x in ((6, 3.0), (7, 3.5)):
         pose = se2.compose(frame, np.array([x, 0.0, 0.0]))
-        way = way.update(event, PoseGaussian(pose, np.eye(3) * 1e-4), shown(pose, []))
+        way = way.update(event, PoseGaussian(pose, np.eye(3) * 1e-4), landmark_openings(pose, []))
     (passage,) = way.crossings
     np.testing.assert_allclose(passage.pose, se2.compose(frame, np.array(DOOR)), atol=1e-6)
 

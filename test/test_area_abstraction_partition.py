@@ -21,10 +21,10 @@ DOOR = 6.0
 
 
 def by_policy(policy, **changes):
-    return area_abstraction(configured(policy, **changes))
+    return area_abstraction(configure(policy, **changes))
 
 
-def configured(policy, **changes):
+def configure(policy, **changes):
     own = {"area_policy": policy, "ncut_threshold": 0.0, "min_cluster": 3, "confirmations": 2} | changes
     return with_changes(Configuration(), OPTIONS | {f"aam.{name}": value for name, value in own.items()})
 
@@ -62,7 +62,7 @@ def test_openings_and_crossings_are_part_of_the_state(stop, tmp_path):
     writer.write("aam", process.state)
     writer.finish("state", 1)
     state = FolderReader(tmp_path, "state", 1).read("aam", AamState)
-    again = area_abstraction(configured("both", **options), state)
+    again = area_abstraction(configure("both", **options), state)
     found, at = looking_ahead(again, THROUGH, stop)
     assert (found.keyframes, found.score, at) == (event.keyframes, event.score, k)
 
@@ -70,7 +70,7 @@ def test_openings_and_crossings_are_part_of_the_state(stop, tmp_path):
 def test_a_state_of_another_policy_goes_on_by_the_own_one():
     process = by_policy("ncut")
     assert looking_ahead(process, THROUGH[:8]) is None
-    event, _ = looking_ahead(area_abstraction(configured("both", ncut_threshold=0.5), process.state), THROUGH, 8)
+    event, _ = looking_ahead(area_abstraction(configure("both", ncut_threshold=0.5), process.state), THROUGH, 8)
     assert event.keyframes[0] == 10
 
 
@@ -85,7 +85,7 @@ def test_areas_with_an_opening_between_them_are_not_one(policy, merged):
     process.handle(Hypotheses(k, (Hypothesis(0, 0, 1.0, 1, exact(np.zeros(3)), begun, (arc,)),)))
     process.handle(ClosureDecision(k, 0, (arc,)))
     changed = {"ncut_threshold": 0.3, "overlap_radius": 2.0, "min_cluster": 5, "portal_factor": 0.01}
-    process = area_abstraction(configured(policy, **changed), process.state)
+    process = area_abstraction(configure(policy, **changed), process.state)
     own_estimate = estimate(0, 1, poses[k], stored=False)
     (answer,) = process.handle(keyframe(k + 1, THROUGH[k], own_estimate))
     assert [event.kind for event in answer.events] == ["merged"] * merged
@@ -93,4 +93,4 @@ def test_areas_with_an_opening_between_them_are_not_one(policy, merged):
 
 def test_a_partition_by_doors_without_landmarks_is_refused():
     with pytest.raises(HmtSlamError, match="area_policy = both needs landmarks"):
-        Aam(configured("both"))
+        Aam(configure("both"))

@@ -51,7 +51,7 @@ class Rounds:
         self.recording = self.run.recorder.finish(self.log_state.stamps)
 
     @property
-    def placed(self):
+    def area_of_keyframe(self):
         """{keyframe: its area} of the map, of which there is one."""
         replica = self.run.state.processes["slam"].replica
         return {k for area in replica.common.area_keyframes().values() for k in area} | {

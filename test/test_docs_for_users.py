@@ -29,7 +29,7 @@ def commands(text):
     return re.findall(r"^    (hmt_slam .*)$", text, re.MULTILINE)
 
 
-def shortened(command):
+def shorten(command):
     return next((more for begin, more in SHORTENED.items() if command.startswith(f"hmt_slam {begin}")), [])
 
 
@@ -42,7 +42,7 @@ def test_every_command_of_the_tutorial_does_what_the_tutorial_says(tmp_path, mon
         if command.startswith("hmt_slam replay"):
             build_parser().parse_args(shlex.split(command)[1:])
             continue
-        assert main([*shlex.split(command)[1:], *shortened(command)]) == 0, command
+        assert main([*shlex.split(command)[1:], *shorten(command)]) == 0, command
         said += capsys.readouterr().out.splitlines()
     for shown in re.findall(r"^    ((?!hmt_slam|ros2|\.\.\.).*)$", TUTORIAL, re.MULTILINE):
         assert any(line.startswith(shown.removesuffix("...")) for line in said), shown

@@ -22,7 +22,7 @@ def belief(x, sigma):
     return PoseGaussian(np.array([x, 0.0, 0.0]), np.diag([sigma, sigma, 0.01]) ** 2)
 
 
-def placed(*poses):
+def area_poses(*poses):
     return {area: PoseGaussian(pose, np.eye(3)) for area, pose in enumerate(poses)}
 
 
@@ -56,12 +56,12 @@ def test_excluded_areas_are_left_out():
 
 
 def test_a_global_pose_that_agrees_with_the_arcs_is_taken():
-    poses = placed(np.array([1.0, 1.0, 0.5]), se2.compose([1.0, 1.0, 0.5], [4.05, 0.0, 0.0]))
+    poses = area_poses(np.array([1.0, 1.0, 0.5]), se2.compose([1.0, 1.0, 0.5], [4.05, 0.0, 0.0]))
     assert np.allclose(consistent_pose(belief(4.0, 0.1), 0, 1, poses, 16.0), [4.05, 0.0, 0.0])
 
 
 def test_a_global_pose_that_contradicts_the_arcs_is_not():
-    poses = placed(np.zeros(3), np.array([6.0, 0.0, 0.0]))
+    poses = area_poses(np.zeros(3), np.array([6.0, 0.0, 0.0]))
     assert np.allclose(consistent_pose(belief(4.0, 0.1), 0, 1, poses, 16.0), [4.0, 0.0, 0.0])
     assert np.allclose(consistent_pose(belief(4.0, 0.1), 0, 7, poses, 16.0), [4.0, 0.0, 0.0])
 

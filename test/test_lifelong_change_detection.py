@@ -73,7 +73,7 @@ def test_a_view_of_a_laser_that_hangs_upside_down_or_moves_in_the_sweep_is_the_s
     assert classify_points(to_polar_scan(moving), places).tolist() == [SURFACE, FREE, UNKNOWN]
 
 
-def test_an_unchanged_room_is_no_news():
+def test_an_unchanged_room_has_no_changes():
     found = changes(room(CUPBOARD), room(CUPBOARD))
     assert (found.has_new_surface, found.has_changed_surface) == (False, False)
     assert not any(late.seen_through.any() or late.starts.any() for late in found.stale_beams.values())

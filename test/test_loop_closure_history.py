@@ -89,7 +89,7 @@ def test_an_arc_found_between_areas_that_keep_their_keyframes_is_finely_aligned(
     assert abs(np.degrees(off[2])) < 0.3
 
 
-def test_a_closure_that_claims_to_be_certain_is_not_moved_beyond_its_gate():
+def test_a_closure_with_a_large_certainty_is_not_moved_beyond_its_gate():
     error = np.array([0.2, -0.15, 0.0])
     _, verdict, *_ = closing_play(error, np.diag([0.01**2, 0.01**2, 0.005**2]))
     assert verdict.moved_keyframes == ()
@@ -99,7 +99,7 @@ def test_a_loop_error_is_distributed_or_left_open_as_configured():
     quarter = np.radians(88.0)
     step = [2.0, 0.0, quarter]
 
-    def around(**changes):
+    def close_ring(**changes):
         play = Play(**changes)
         play.start()
         for area in (1, 2, 3):
@@ -109,11 +109,11 @@ def test_a_loop_error_is_distributed_or_left_open_as_configured():
         poses = np.array([poses_of(verdict)[area].mean for area in (0, 1, 2, 3, 0)])
         return play, np.degrees(se2.between(poses[:-1], poses[1:])[:, 2])
 
-    play, turns = around()
+    play, turns = close_ring()
     np.testing.assert_allclose(turns, 90.0, atol=1e-6)
     shortest_paths = shortest_path_map(play.process._replica.maps[0]).poses
     tree = np.array([shortest_paths[area].mean for area in (0, 1, 2, 3, 0)])
-    _, turns = around(global_map="shortest_path")
+    _, turns = close_ring(global_map="shortest_path")
     np.testing.assert_allclose(turns, np.degrees(se2.between(tree[:-1], tree[1:])[:, 2]), atol=1e-9)
     assert np.ptp(turns) > 5.0
 

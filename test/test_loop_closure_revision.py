@@ -33,7 +33,7 @@ ODOMETRY, MATCH = np.diag([0.3, 0.3, 0.02]) ** 2, np.diag([0.05, 0.05, 0.01]) **
 NEXT = np.array([4.0, 0.0, 0.0])  # from the frame of an area to that of the next
 
 
-def around(a, b):
+def true_motion(a, b):
     """Truth: ``a_T_b`` of areas along a straight corridor."""
     return (b - a) * NEXT
 
@@ -50,8 +50,8 @@ def corridor(areas):
     return hybrid_map, history
 
 
-def closed(hybrid_map, event, near, far, error=(0.0, 0.0, 0.0), log_odds=4.6):
-    belief = PoseGaussian(se2.compose(around(near, far), np.array(error)), MATCH)
+def make_closure(hybrid_map, event, near, far, error=(0.0, 0.0, 0.0), log_odds=4.6):
+    belief = PoseGaussian(se2.compose(true_motion(near, far), np.array(error)), MATCH)
     hybrid_map.set_arc(near, far, belief, closure=True)
     return Closure((event, (min(near, far), max(near, far))), near, far, belief, log_odds, MapSnapshot({}, {}))
 
@@ -69,7 +69,7 @@ def drive_with(*found, areas=8, area=7):
     hybrid_map, history = corridor(areas)
     closures = []
     for event, near, far, error in found:
-        closures.append(closed(hybrid_map, event, near, far, error))
+        closures.append(make_closure(hybrid_map, event, near, far, error))
         history += (PathStep(event, near, near, (closures[-1].pair,)),)
     return path_of(hybrid_map, history, closures, area)
 
@@ -80,7 +80,7 @@ def find_inconsistency(path, event):
     )
 
 
-def test_closures_that_agree_raise_no_doubt():
+def test_closures_that_agree_raise_no_inconsistency():
     path = drive_with((80, 7, 0, (0.05, 0.0, 0.0)), (81, 6, 1, (0.0, -0.05, 0.0)), (82, 7, 2, (0.0, 0.0, 0.0)))
     assert find_inconsistency(path, 82) is None
 
@@ -121,11 +121,11 @@ def test_closures_that_were_accepted_because_of_a_false_one_go_with_it_and_true_
     assert [c.closure_id[0] for c in best.path.closures] == [79, 90, 91]
 
 
-def joined():
+def false_account():
     """From area 3 the robot falsely enters area 0: it stores keyframes 41, 42 there, goes on to area 1, stores 45, and
     leaves it for area 4, which is new."""
     hybrid_map, history = corridor(4)
-    closure = closed(hybrid_map, 40, 3, 0)
+    closure = make_closure(hybrid_map, 40, 3, 0)
     hybrid_map.set_keyframe(39, 0, np.array([0.2, 0.1, 0.0]))
     hybrid_map.set_keyframe(41, 0, np.array([0.5, 0.1, 0.0]))
     hybrid_map.set_keyframe(42, 0, np.array([1.0, 0.1, 0.0]))
@@ -149,7 +149,7 @@ def in_frame_of(hybrid_map, *areas):
 
 
 def test_keyframes_stored_after_a_false_closure_become_a_separate_area():
-    before = joined()
+    before = false_account()
     found = withdraw_closure(before, before.closures[0].closure_id, 9)
     hybrid_map = found.hybrid_map
     assert {a: sorted(hybrid_map.keyframes(a)) for a in hybrid_map.area_ids()} == {
@@ -178,7 +178,7 @@ def test_keyframes_stored_after_a_false_closure_become_a_separate_area():
 
 
 def test_a_robot_that_is_in_an_area_falsely_is_then_in_the_new_one():
-    before = joined()
+    before = false_account()
     hybrid_map = before.hybrid_map.branch()
     hybrid_map.remove_arc(1, 4)
     found = withdraw_closure(
@@ -201,7 +201,7 @@ def test_a_link_that_the_robot_never_crossed_is_only_taken_out():
 def test_a_rollback_restores_moved_keyframes_and_moves_later_ones_along():
     hybrid_map, history = corridor(4)
     bent = np.array([0.3, 0.2, 0.05])
-    closure = closed(hybrid_map, 40, 3, 0)
+    closure = make_closure(hybrid_map, 40, 3, 0)
     former = {k: (3, hybrid_map.keyframes(3)[k].copy()) for k in (30, 31)}
     undo = MapSnapshot(former, {(2, 3): ArcValue(PoseGaussian(NEXT, ODOMETRY), closure=False)})
     for k in (30, 31):
@@ -231,7 +231,7 @@ def test_an_area_that_became_part_of_another_is_that_one_in_the_account():
     path = drive_with((80, 6, 3, TRUE), (81, 7, 1, FALSE), (82, 6, 0, TRUE))
     history, closures = apply_area_merge(path, AreaMerge(6, 3, path.hybrid_map.arc(3, 6)))
     assert [(c.closure_id[0], c.near, c.far) for c in closures] == [(81, 7, 1), (82, 3, 0)]
-    np.testing.assert_allclose(closures[1].pose.mean, around(3, 0), atol=1e-9)
+    np.testing.assert_allclose(closures[1].pose.mean, true_motion(3, 0), atol=1e-9)
     steps = [(step.event, step.area_before, step.area_after, step.new_arcs) for step in history]
     assert steps[4:] == [
         (50, 4, 5, ((4, 5),)),
@@ -264,7 +264,7 @@ def test_a_rollback_after_a_merge():
     for k, (area, pose) in former.items():
         hybrid_map.set_keyframe(k, area, se2.compose(bent, pose))
     arcs = {pair: hybrid_map.arc_value(*pair) for pair in ((1, 2), (2, 3))}
-    closure = replace(closed(hybrid_map, 40, 2, 0), snapshot=MapSnapshot(former, arcs))
+    closure = replace(make_closure(hybrid_map, 40, 2, 0), snapshot=MapSnapshot(former, arcs))
     path = path_of(hybrid_map, history, [closure], 2)
     history, closures = apply_area_merge(path, AreaMerge(3, 2, path.hybrid_map.arc(2, 3)))
     assert set(closures[0].snapshot.keyframes) == {20, 21}
@@ -360,7 +360,7 @@ def test_every_process_has_the_same_map_from_messages_alone(drives):
                 np.testing.assert_array_equal(arc.pose.mean, other.pose.mean)
 
 
-def test_a_true_closure_is_not_doubted(drives):
+def test_a_true_closure_is_not_rejected(drives):
     recording, _ = drives[0]
     assert [notice for notice in recording.notices if notice.process == "tlca"] == []
     assert any(arc.closure for _, _, arc in recording.hybrid_map.all_arcs())

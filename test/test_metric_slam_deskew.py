@@ -64,7 +64,7 @@ class Drive(NamedTuple):
         return float(np.sqrt(np.mean(np.sum(self.errors[:, :2] ** 2, axis=1))))
 
 
-def driven(sweep, timed):
+def drive_sweeping(sweep, timed):
     """A drive with a laser whose sweep takes ``sweep`` seconds; ``timed`` scans have a time increment."""
     odometry, dialogue = list(readings()), Dialogue()
     for k in range(SCANS):
@@ -87,9 +87,9 @@ def driven(sweep, timed):
 @pytest.fixture(scope="module")
 def drives():
     return {
-        "standing": driven(0.0, timed=True),
-        "skewed": driven(0.1, timed=False),
-        "deskewed": driven(0.1, timed=True),
+        "standing": drive_sweeping(0.0, timed=True),
+        "skewed": drive_sweeping(0.1, timed=False),
+        "deskewed": drive_sweeping(0.1, timed=True),
     }
 
 
@@ -129,7 +129,7 @@ def test_at_the_end_of_a_log_the_last_sweep_goes_on_as_the_odometry_did():
     np.testing.assert_allclose(dialogue.of(Keyframe)[0].scan.motion, (0.09, 0.0, 0.0), atol=1e-9)
 
 
-def test_an_impossible_time_increment_is_said_once_and_no_scan_is_lost():
+def test_an_impossible_time_increment_is_reported_once_and_no_scan_is_lost():
     dialogue = Dialogue()
     for k in range(10):
         stamp = SECOND + k * SECOND // 10

@@ -36,7 +36,7 @@ def errors(dialogue, truths):
 
 @pytest.mark.parametrize("rate", [1.0, 5.0])
 @pytest.mark.parametrize("slip", [-40.0, 40.0])
-def test_a_slip_in_a_turn_does_not_lose_the_robot_and_is_said_once(rate, slip):
+def test_a_slip_in_a_turn_does_not_lose_the_robot_and_is_reported_once(rate, slip):
     dialogue, truths = Dialogue(), []
     odometry, before = np.zeros(3), np.zeros(3)
     for stamp, pose, scan in turning_drive(rate):
@@ -105,7 +105,7 @@ def test_readings_that_are_missing_here_and_there_are_bridged():
     assert not dialogue.of(Notice)
 
 
-def test_noise_beyond_the_model_is_learnt_and_said_once():
+def test_noise_beyond_the_model_is_learnt_and_reported_once():
     random = np.random.default_rng(0)
     dialogue, truths = Dialogue(), []
     odometry, before = np.zeros(3), np.zeros(3)

@@ -14,7 +14,7 @@ import hmt_slam_ros
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(hmt_slam_ros.__file__).parent
 
-PROSE_FOLDERS = (ROOT / "benchmark", ROOT / "scripts", ROOT / "test")
+PROSE_FOLDERS = (PACKAGE, ROOT / "benchmark", ROOT / "scripts", ROOT / "test")
 """Folders whose docstrings, comments and locals have no retired words, and whose functions are verbs or nouns."""
 
 NAME_FOLDERS = (PACKAGE, ROOT / "benchmark", ROOT / "scripts")

@@ -27,7 +27,7 @@ def estimate(seconds, pose, odom, area=0, variance=1e-4):
     return LocalEstimate(round(seconds * SECOND), 0, area, belief, np.array(odom, dtype=np.float64), 0)
 
 
-def accepted(**areas):
+def make_decision(**areas):
     poses = tuple(
         AreaPose(int(name[1:]), PoseGaussian(np.array(pose, dtype=np.float64), np.eye(3) * 0.01))
         for name, pose in areas.items()
@@ -40,11 +40,11 @@ def rtl():
     return Rtl(Configuration())
 
 
-def test_nothing_is_said_before_the_first_estimate(rtl):
+def test_nothing_is_sent_before_the_first_estimate(rtl):
     assert rtl.handle(odometry(0.0, 0, 0, 0)) == []
 
 
-def test_each_odometry_reading_is_answered_with_the_estimate_carried_on(rtl):
+def test_each_odometry_reading_is_answered_with_the_estimate_extrapolated(rtl):
     rtl.handle(odometry(0.0, 5, 5, math.pi / 2))
     assert rtl.handle(estimate(0.0, (1, 2, 0), (5, 5, math.pi / 2))) == []
     (answer,) = rtl.handle(odometry(0.1, 5, 5.3, math.pi / 2))
@@ -70,7 +70,7 @@ def test_an_estimate_between_two_readings_starts_at_its_own_odometry(rtl):
 
 
 def test_the_map_pose_is_the_areas_pose_and_the_pose_in_the_area(rtl):
-    rtl.handle(accepted(a0=(0, 0, 0), a3=(10, 0, math.pi / 2)))
+    rtl.handle(make_decision(a0=(0, 0, 0), a3=(10, 0, math.pi / 2)))
     rtl.handle(odometry(0.0, 0, 0, 0))
     rtl.handle(estimate(0.0, (1, 0, 0), (0, 0, 0), area=3))
     (answer,) = rtl.handle(odometry(0.1, 0.5, 0, 0))
@@ -87,17 +87,17 @@ def test_a_new_area_waits_for_its_place_in_the_map(rtl):
     (before,) = rtl.handle(odometry(0.2, 0.2, 0, 0))
     assert before.area == 0
     assert np.allclose(before.map_pose.mean, (0.2, 0, 0))
-    rtl.handle(accepted(a0=(0, 0, 0), a1=(0.1, 0, 0)))
+    rtl.handle(make_decision(a0=(0, 0, 0), a1=(0.1, 0, 0)))
     (after,) = rtl.handle(odometry(0.3, 0.3, 0, 0))
     assert after.area == 1
     assert np.allclose(after.map_pose.mean, (0.3, 0, 0))
 
 
 def test_the_robots_area_keeps_its_place_when_a_hypothesis_without_it_takes_the_lead(rtl):
-    rtl.handle(accepted(a0=(0, 0, 0), a3=(10, 0, 0)))
+    rtl.handle(make_decision(a0=(0, 0, 0), a3=(10, 0, 0)))
     rtl.handle(odometry(0.0, 0, 0, 0))
     rtl.handle(estimate(0.0, (1, 0, 0), (0, 0, 0), area=3))
-    rtl.handle(accepted(a0=(0, 5, 0), a1=(4, 0, 0)))
+    rtl.handle(make_decision(a0=(0, 5, 0), a1=(4, 0, 0)))
     (answer,) = rtl.handle(odometry(0.1, 0.1, 0, 0))
     assert np.allclose(answer.map_pose.mean, (11.1, 0, 0))
     rtl.handle(estimate(0.2, (2, 0, 0), (0.2, 0, 0), area=1))
@@ -123,7 +123,7 @@ def test_driving_to_and_fro_does_not_make_the_robot_sure_again(rtl):
     assert back.pose_in_area.covariance[0, 0] > there.pose_in_area.covariance[0, 0]
 
 
-def test_an_odometry_reset_is_told_once_and_the_robot_stays_where_it_was(rtl):
+def test_an_odometry_reset_is_reported_once_and_the_robot_stays_where_it_was(rtl):
     rtl.handle(odometry(0.0, 40, 10, 1.0))
     rtl.handle(estimate(0.0, (2, 0, 0), (40, 10, 1.0)))
     rtl.handle(odometry(0.1, 40, 10, 1.0))

@@ -18,7 +18,7 @@ REACH = 6.0
 ASKED = se2.compose(np.array([3.6, 2.6, 2.5]), np.array([[0.3 * k, 0.0, 0.05 * k] for k in range(4)]))
 
 
-def seen(walls, pose, keyframe):
+def make_scan(walls, pose, keyframe):
     return scan_in(walls, pose, noise=0.01, seed=keyframe, field_of_view=2 * np.pi, beams=361)
 
 
@@ -28,9 +28,9 @@ def query():
     hybrid_map, scans = HybridMap(), {}
     for area, walls in enumerate((ROOM, OTHER)):
         for k, pose in enumerate(PATH):
-            scans[6 * area + k] = seen(walls, pose, 6 * area + k)
+            scans[6 * area + k] = make_scan(walls, pose, 6 * area + k)
             hybrid_map.set_keyframe(6 * area + k, area, se2.between(PATH[0], pose))
-    scans |= {12 + k: seen(ROOM, pose, 12 + k) for k, pose in enumerate(ASKED)}
+    scans |= {12 + k: make_scan(ROOM, pose, 12 + k) for k, pose in enumerate(ASKED)}
     poses = {12 + k: se2.between(ASKED[0], pose) for k, pose in enumerate(ASKED)}
     return hybrid_map, poses, scans
 
@@ -75,7 +75,7 @@ def test_a_room_is_recognized_despite_traces_of_people_in_its_map(query, match):
     crowd = np.concatenate([box(x, y, x + 0.3, y + 0.3) for x in (0.8, 2.2, 4.3) for y in (0.9, 2.0, 3.4)])
     walls = np.concatenate((ROOM, crowd))
     for k, pose in enumerate(PATH):
-        scans[20 + k] = seen(walls, pose, 20 + k)
+        scans[20 + k] = make_scan(walls, pose, 20 + k)
         hybrid_map.set_keyframe(20 + k, 0, se2.between(PATH[0], pose))
     best = max(match([0, 1]), key=lambda fit: fit.mode.log_mass)
     assert best.area == 0
@@ -87,7 +87,7 @@ def test_people_in_the_scans_do_not_count_against_a_place(query, match):
     _, poses, scans = query
     for n, keyframe in enumerate(poses):
         people = [box(x, y, x + 0.4, y + 0.4) for x, y in ((0.6 + 1.1 * n, 0.6), (4.6 - 1.0 * n, 1.2))]
-        scans[keyframe] = seen(np.concatenate((ROOM, *people)), ASKED[n], keyframe)
+        scans[keyframe] = make_scan(np.concatenate((ROOM, *people)), ASKED[n], keyframe)
     best = max(match([0, 1]), key=lambda fit: fit.mode.log_mass)
     assert best.area == 0
     assert position_error(best) < 0.05
@@ -99,7 +99,7 @@ def test_all_of_many_areas_are_searched(query, match):
     for area in range(2, 24):
         for k, pose in enumerate(PATH):
             keyframe = 100 + 6 * area + k
-            scans[keyframe] = seen(OTHER, pose, keyframe)
+            scans[keyframe] = make_scan(OTHER, pose, keyframe)
             hybrid_map.set_keyframe(keyframe, area, se2.between(PATH[0], pose))
     assert max(match(range(24)), key=lambda fit: fit.mode.log_mass).area == 0
 
@@ -125,7 +125,7 @@ def test_only_the_given_areas_are_searched(match):
 def test_a_candidate_is_in_the_frame_of_its_area_anywhere_in_its_region(query, match):
     hybrid_map, _, scans = query
     for k, pose in enumerate(PATH):
-        scans[30 + k] = seen(ROOM, pose, 30 + k)
+        scans[30 + k] = make_scan(ROOM, pose, 30 + k)
         hybrid_map.set_keyframe(30 + k, 2, se2.between(PATH[0], pose))
     hybrid_map.set_arc(1, 2, PoseGaussian(np.array([1.0, -5.5, 2.0]), 1e-4 * np.eye(3)), closure=False)
     found = match([2])

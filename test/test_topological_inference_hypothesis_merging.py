@@ -24,7 +24,7 @@ def chain(covariance=SHARP):
     return hybrid_map
 
 
-def entered(area, pose, covariance=SHARP):
+def enter_known_area(area, pose, covariance=SHARP):
     """From area 3 the robot came into a known one, where it is at ``area_T_base``."""
     hybrid_map = chain(VAGUE)
     hybrid_map.set_arc(3, area, PoseGaussian(area * STEP - np.array([5.0, 0.0, 0.0]), covariance), closure=True)
@@ -41,8 +41,8 @@ def with_sharp_arc(hypothesis):
     return hypothesis
 
 
-def test_the_same_place_entered_by_one_area_or_by_the_next_is_one_claim():
-    one, other = with_sharp_arc(entered(0, POSE)), with_sharp_arc(entered(1, in_next_area(POSE)))
+def test_the_same_place_entered_by_one_area_or_by_the_next_is_one_placement():
+    one, other = with_sharp_arc(enter_known_area(0, POSE)), with_sharp_arc(enter_known_area(1, in_next_area(POSE)))
     assert one.is_equivalent(other)
     assert other.is_equivalent(one)
 
@@ -50,13 +50,13 @@ def test_the_same_place_entered_by_one_area_or_by_the_next_is_one_claim():
 @pytest.mark.parametrize(
     ("offset", "same"), [([0.3, 0.2, 0.05], True), ([0.7, 0.0, 0.0], False), ([0.0, 0.0, 0.2], False)]
 )
-def test_modes_that_part_by_less_than_is_mended_are_one_claim(offset, same):
-    assert entered(0, POSE).is_equivalent(entered(0, se2.compose(POSE, np.array(offset)))) == same
+def test_modes_that_part_by_less_than_is_mended_are_one_placement(offset, same):
+    assert enter_known_area(0, POSE).is_equivalent(enter_known_area(0, se2.compose(POSE, np.array(offset)))) == same
 
 
-def test_known_ground_is_a_claim_of_its_own():
+def test_known_ground_is_a_placement_of_its_own():
     tracked = LocalizedHypothesis(chain(), 0, POSE, {0})
-    recognized = entered(0, POSE)
+    recognized = enter_known_area(0, POSE)
     assert not tracked.is_equivalent(recognized)
     assert not recognized.is_equivalent(tracked)
 
@@ -68,14 +68,14 @@ def with_another_loop(hypothesis, covariance=SHARP):
 
 
 @pytest.mark.parametrize("covariance", [SHARP, 100.0 * SHARP])
-def test_a_further_loop_is_a_claim_of_its_own(covariance):
-    open_still, closed = entered(0, POSE), with_another_loop(entered(0, POSE), covariance)
+def test_a_further_loop_is_a_placement_of_its_own(covariance):
+    open_still, closed = enter_known_area(0, POSE), with_another_loop(enter_known_area(0, POSE), covariance)
     assert not open_still.is_equivalent(closed)
     assert not closed.is_equivalent(open_still)
 
 
-def test_a_loop_that_one_hypothesis_closes_by_two_arcs_and_one_by_the_second_is_one_claim():
-    direct, around = entered(0, POSE), with_another_loop(entered(0, POSE))
+def test_a_loop_that_one_hypothesis_closes_by_two_arcs_and_one_by_the_second_is_one_placement():
+    direct, around = enter_known_area(0, POSE), with_another_loop(enter_known_area(0, POSE))
     for hypothesis in (direct, around):
         hypothesis.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
         hypothesis.hybrid_map.set_arc(1, 2, PoseGaussian(STEP, SHARP), closure=False)
@@ -84,11 +84,11 @@ def test_a_loop_that_one_hypothesis_closes_by_two_arcs_and_one_by_the_second_is_
 
 
 def test_uncertain_poses_imply_no_closure():
-    assert not entered(0, POSE).is_equivalent(entered(1, in_next_area(POSE)))
+    assert not enter_known_area(0, POSE).is_equivalent(enter_known_area(1, in_next_area(POSE)))
 
 
-def test_the_heaviest_stands_for_all_that_say_the_same():
-    hypotheses = [entered(0, POSE), entered(1, POSE), entered(0, POSE + 0.01)]
+def test_the_heaviest_represents_all_equivalent_ones():
+    hypotheses = [enter_known_area(0, POSE), enter_known_area(1, POSE), enter_known_area(0, POSE + 0.01)]
     weights = np.log([0.2, 0.3, 0.5])
     found = merge_equivalent(hypotheses, weights)
     assert list(found) == [2, 1]

@@ -227,7 +227,7 @@ def test_a_false_alarm_keeps_a_similar_place_from_being_accepted():
     assert known.with_false_alarm(np.array([True, False]), 0.5, 4).probabilities[0] > 0.8
 
 
-def test_scans_that_the_map_does_not_hold_are_remembered_as_long_as_they_are_doubtful():
+def test_scans_that_the_map_does_not_hold_are_remembered_as_long_as_they_are_uncertain():
     run, poses = Run(RING), ring_drive(8)
     for pose in poses[:6]:
         run.keyframe(pose)
@@ -260,7 +260,7 @@ def test_small_contradictions_at_every_keyframe_are_clutter():
     assert state.kidnapping_test(1e-5) == (-math.inf, 0)
 
 
-def test_a_doubt_passes_with_scans_that_fit():
+def test_an_inconsistency_passes_with_scans_that_fit():
     state = HypothesisState().after_scan(5, 4.0)
     for event in range(6, 9):
         state = state.after_scan(event, -0.3)

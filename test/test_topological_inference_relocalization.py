@@ -87,7 +87,7 @@ def test_without_landmarks_as_prior_it_is_recognized_too(maps, share):
     assert found.found <= FAR
 
 
-def test_in_the_map_of_the_first_half_it_wakes_up_in_the_second_near_keyframes_of_the_first(maps):
+def test_in_the_map_of_the_first_half_it_starts_in_the_second_near_keyframes_of_the_first(maps):
     log, whole = maps["first half"], maps["whole"]
     scans = Replica.from_state(log.state.processes["tsbi"].replica).scans.values()
     stamps = {log.records[scan].measurement.stamp: n for n, scan in enumerate(log.scans)}
@@ -147,7 +147,7 @@ def test_a_standing_robot_is_relocalized_at_an_initial_pose(office, begin):
     assert sum(hypothesis.probability for hypothesis in hypotheses if not hypothesis.lost) > 0.9
 
 
-def test_scans_are_counted_on_and_odometry_begins_anew(office, begin):
+def test_scans_are_counted_on_and_odometry_restarts(office, begin):
     run = run_in_map(office, office.records[begin:], 25)
     assert run.state.processes["slam"].processed_scans == office.state.processes["slam"].processed_scans + 25
     assert run.state.processes["slam"].dropped_scans == 0

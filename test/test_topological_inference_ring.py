@@ -61,7 +61,7 @@ def test_the_arc_that_closes_the_ring_is_precise(ring):
     assert away @ np.linalg.solve(value.pose.covariance, away) < 16.3
 
 
-def test_two_runs_say_the_same_to_the_bit(ring):
+def test_two_runs_are_the_same_to_the_bit(ring):
     run, _ = ring
     again, _ = around_the_ring()
     for a, b in zip(run.answers, again.answers, strict=True):

@@ -175,7 +175,7 @@ def test_ground_tracked_by_way_of_another_area_is_joined_by_a_measured_arc():
     assert answers[-1].hypotheses[0].probability == 1.0
 
 
-def ring_with_two_leaves(apart=1.0):
+def ring_with_two_hypotheses(apart=1.0):
     """Two live hypotheses that have the robot ``apart``, m, as TSBI would have made them."""
     run = Run(RING)
     run.keyframe(np.array([3.0, 1.0, 0.0]))
@@ -195,7 +195,7 @@ def split_in_two(run, apart):
 
 
 def test_the_evidence_of_the_scans_shifts_the_weights():
-    run = ring_with_two_leaves()
+    run = ring_with_two_hypotheses()
     first, second = sorted(run.poses)
     before = dict(run.replica.probabilities)
     run.evidence = {first: 0.0, second: 1.5}
@@ -204,8 +204,8 @@ def test_the_evidence_of_the_scans_shifts_the_weights():
     assert after[second] / after[first] == pytest.approx(math.exp(1.5) * before[second] / before[first])
 
 
-def test_hypotheses_that_say_the_same_become_one_with_the_weight_of_both():
-    run = ring_with_two_leaves(apart=0.2)
+def test_hypotheses_that_are_equivalent_become_one_with_the_weight_of_both():
+    run = ring_with_two_hypotheses(apart=0.2)
     run.evidence = {1: 0.0, 2: 1.5}
     (hypothesis,) = run.keyframe(run.true_pose).hypotheses
     assert hypothesis.id == 2
@@ -236,7 +236,7 @@ def test_recent_keyframes_are_no_known_ground():
 
 
 def test_acceptance_leaves_one_hypothesis():
-    run = ring_with_two_leaves()
+    run = ring_with_two_hypotheses()
     run.accept(2)
     (hypothesis,) = run.keyframe(run.true_pose).hypotheses
     assert (hypothesis.id, hypothesis.parent, hypothesis.probability) == (2, 2, 1.0)
