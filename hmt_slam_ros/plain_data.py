@@ -144,12 +144,12 @@ class PlainDataReader:
 
     def _union(self, field: str, arguments: tuple[Any, ...]) -> Reader:
         kinds = [argument for argument in arguments if argument is not type(None)]
-        reader = self._reader(field, kinds[0]) if len(kinds) == 1 else self._tagged(kinds)
+        reader = self._reader(field, kinds[0]) if len(kinds) == 1 else self._tagged_union(kinds)
         if len(kinds) == len(arguments):
             return reader
         return lambda content, path: None if content is None else reader(content, path)
 
-    def _tagged(self, kinds: list[type]) -> Reader:
+    def _tagged_union(self, kinds: list[type]) -> Reader:
         """The reader of a union of dataclasses, by the word in the field ``kind``."""
         readers = {get_args(get_type_hints(kind)["kind"])[0]: self._reader("", kind) for kind in kinds}
 

@@ -1,4 +1,4 @@
-"""Normalised cut on graphs whose best bipartition is known, and against all bipartitions of small random graphs."""
+"""Normalized cut on graphs whose best bipartition is known, and against all bipartitions of small random graphs."""
 
 import itertools
 

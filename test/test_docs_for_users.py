@@ -37,15 +37,15 @@ def test_every_command_of_the_tutorial_does_what_the_tutorial_says(tmp_path, mon
     (tmp_path / "data").symlink_to(ROOT / "data")
     monkeypatch.chdir(tmp_path)
     assert len(commands(TUTORIAL)) >= 8
-    said = []
+    output = []
     for command in commands(TUTORIAL):
         if command.startswith("hmt_slam replay"):
             build_parser().parse_args(shlex.split(command)[1:])
             continue
         assert main([*shlex.split(command)[1:], *shorten(command)]) == 0, command
-        said += capsys.readouterr().out.splitlines()
+        output += capsys.readouterr().out.splitlines()
     for shown in re.findall(r"^    ((?!hmt_slam|ros2|\.\.\.).*)$", TUTORIAL, re.MULTILINE):
-        assert any(line.startswith(shown.removesuffix("...")) for line in said), shown
+        assert any(line.startswith(shown.removesuffix("...")) for line in output), shown
     for path in re.findall(r"`(output/[^`]+)`", TUTORIAL):
         assert (tmp_path / path).exists(), path
     for name in ("pmf.png", "cost.png", "trajectory.tum", "report.json"):

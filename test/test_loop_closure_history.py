@@ -1,4 +1,4 @@
-"""Topological Loop Closure Acceptance: closures are aligned, spread over loops, doubted on contradiction."""
+"""Topological Loop Closure Acceptance: closures are aligned, spread over loops, revised on contradiction."""
 
 from dataclasses import replace
 

@@ -54,9 +54,13 @@ RETIRED = re.compile(
 RETIRED_NAMES = {"told", "said", "asked", "heard", "leaf", "leaves", "news", "whereabouts", "errand", "errands"}
 RETIRED_NAMES |= {"astray", "doubts", "spots"}
 
+DOCTOR = ("beams", "finding", "odometry", "running", "timing")
+
 ALLOWED_PROSE = {
     "benchmark/awakening.py": {"awakening"},  # Robot awakening [B], the kind of the measurement
     "benchmark/__main__.py": {"awakening"},
+    **{f"hmt_slam_ros/doctor/{name}.py": {"doubtful"} for name in DOCTOR},  # a severity of findings
+    "hmt_slam_ros/topological_inference/global_localization.py": {"awakening"},  # the paper's word
     "test/test_configuration_tree.py": {"leaf", "leaves"},  # of the tree of parameters
     "test/test_ros_parameters.py": {"leaf", "leaves"},
     "test/test_saved_map.py": {"doubt"},  # a field of the example

@@ -1,4 +1,4 @@
-"""Equivalent hypotheses are told apart from others."""
+"""Equivalent hypotheses are distinguished from others."""
 
 import numpy as np
 import pytest

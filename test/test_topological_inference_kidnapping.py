@@ -36,7 +36,7 @@ NOWHERE = np.concatenate((box(-1.0, 1.0, 4.2, 6.5), box(2.6, 4.0, 3.6, 5.0)))
 HALL = np.concatenate((box(-3.0, 0.5, 9.0, 4.5), box(4.0, 3.0, 5.0, 4.0)))
 
 
-def spawned(rooms, evidence, first=FAR, hall=2):
+def spawn(rooms, evidence, first=FAR, hall=2):
     """The children after CUSUM increments in the last room, {keyframe of it: nats}; rooms but the first are far.
 
     The robot was kidnapped there from a hall, in which it stored ``hall`` keyframes.
@@ -56,7 +56,7 @@ def since(child):
 
 
 def test_the_keyframes_since_then_begin_an_area_with_an_uninformative_arc():
-    stays, lost = spawned((ROOM, OTHER, ROOM), {2: 8.0}).children
+    stays, lost = spawn((ROOM, OTHER, ROOM), {2: 8.0}).children
     assert (stays.area, stays.log_weight, stays.moved_keyframes) == (2, 0.0, ())
     assert lost.area == 3
     assert lost.state.localization.since == 14
@@ -72,7 +72,7 @@ def test_the_keyframes_since_then_begin_an_area_with_an_uninformative_arc():
 
 
 def test_a_match_elsewhere_is_evidence_for_it_and_the_first_candidate():
-    _, lost = spawned((ROOM, OTHER, ROOM), {2: 8.0}).children
+    _, lost = spawn((ROOM, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight > PRIOR + 8.0 + 1.0
     assert lost.state.localization.counted_evidence == pytest.approx(lost.log_weight - PRIOR - 8.0)
     assert lost.state.localization.candidate.area == 0
@@ -108,13 +108,13 @@ def test_without_mapping_it_moves_to_the_area_of_its_relocalization(mapping, are
 
 
 def test_on_unmapped_ground_only_the_cusum_statistic_counts():
-    _, lost = spawned((OTHER, OTHER, ROOM), {2: 8.0}).children
+    _, lost = spawn((OTHER, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight == pytest.approx(PRIOR + 8.0 + math.log(KIDNAPPED_UNMAPPED_PRIOR), abs=0.5)
     assert lost.state.localization.candidate is None
 
 
 def test_a_match_at_the_tracked_pose_is_evidence_against_it():
-    _, lost = spawned((ROOM, OTHER, ROOM), {2: 8.0}, HERE, hall=0).children
+    _, lost = spawn((ROOM, OTHER, ROOM), {2: 8.0}, HERE, hall=0).children
     assert lost.log_weight < PRIOR + 8.0 - 2.0
 
 
@@ -124,11 +124,11 @@ def test_a_match_at_the_tracked_pose_is_evidence_against_it():
     ids=["sure", "hardly doubtful", "just now, and two keyframes are too few"],
 )
 def test_an_improbable_kidnapping_spawns_no_hypothesis(evidence):
-    assert spawned((ROOM, OTHER, ROOM), evidence) is None
+    assert spawn((ROOM, OTHER, ROOM), evidence) is None
 
 
 def test_an_area_is_not_left_without_keyframes():
-    _, lost = spawned((ROOM, OTHER, ROOM), {0: 8.0}).children
+    _, lost = spawn((ROOM, OTHER, ROOM), {0: 8.0}).children
     assert [r.keyframe for r in lost.moved_keyframes] == [13, 14, 15, 16, 17]
 
 

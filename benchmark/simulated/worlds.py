@@ -28,7 +28,7 @@ SETTINGS = {
 FAMILIES = tuple(SETTINGS)
 
 LONG = "long"
-"""2 km of nested loops; it is mapped only where it is asked for by its name."""
+"""2 km of nested loops; mapped only on request by its name."""
 
 INSTITUTE = "institute"
 """Hallways with open and closed doors and crossings, for what is measured there alone."""

@@ -1,7 +1,7 @@
 """Roadmap of keyframes over an HMT map, with the frontiers and rooms beside them.
 
 The robot can return to the pose of any keyframe. The roadmap joins keyframes between which a straight line is free.
-Roadmap and frontiers are updated around the robot alone. Hallways and rooms are told apart as in Tomatis, Nourbakhsh
+Roadmap and frontiers are updated around the robot alone. Hallways and rooms are distinguished as in Tomatis, Nourbakhsh
 and Siegwart (2003), section 3.1.
 """
 

@@ -65,9 +65,9 @@ def linearize(poses: Float64, sources: Int64, targets: Int64, measured: Float64)
     adjoint = np.zeros((3, 3))  # of the inverse of the relative pose
     for e in range(m):
         i, j = sources[e], targets[e]
-        x, y, angle = _between(poses[i], poses[j])
+        x, y, angle = _relative_pose(poses[i], poses[j])
         relative = np.array((x, y, angle))
-        x, y, angle = _between(measured[e], relative)
+        x, y, angle = _relative_pose(measured[e], relative)
         _log(x, y, angle, residuals[e])
         _right_jacobian_inverse(residuals[e], of_target[e])
         cos, sin = np.cos(relative[2]), np.sin(relative[2])
@@ -84,7 +84,7 @@ def linearize(poses: Float64, sources: Int64, targets: Int64, measured: Float64)
 
 
 @njit(cache=True)
-def _between(a: Float64, b: Float64) -> tuple[float, float, float]:
+def _relative_pose(a: Float64, b: Float64) -> tuple[float, float, float]:
     cos, sin = np.cos(a[2]), np.sin(a[2])
     x, y = se2.rotate_back(cos, sin, b[0] - a[0], b[1] - a[1])
     return x, y, se2.wrap_by_turns(b[2] - a[2])

@@ -213,7 +213,7 @@ class LineFilter:
 
     def track(self, prepared: PreparedScan, prediction: Prediction) -> TrackedMotion:
         """Predict and correct by the scan's lines."""
-        before, lines = self.pose, prepared.derived(lines_of_scan)
+        before, lines = self.pose, prepared.derive(lines_of_scan)
         posterior, contradicted = self._most_likely_posterior(lines, prediction)
         self.line_map = posterior.line_map
         self._motion_since_update = self._motion_since_update.compose(posterior.motion)

@@ -143,7 +143,7 @@ class Tlca:
 
     A path is accepted when it has dominated for some keyframes and meters since it branched off, and at once when no
     other is left. Then the others are dropped, the areas that it joined are aligned, and arcs are fused with earlier
-    traversals. If accepted closures contradict each other, TSBI is asked to decide between explanations.
+    traversals. If accepted closures contradict each other, TSBI decides between explanations.
     """
 
     def __init__(self, configuration: Configuration, state: TlcaState | None = None) -> None:

@@ -273,7 +273,7 @@ class MetricSlam:
     def _reset_filters(self, prediction: Prediction) -> None:
         """Initialize every filter at its pose after the predicted motion.
 
-        The motion of a carried robot is unknown and predicted as none; a robot that is lost may be so by mistake.
+        The motion of a kidnapped robot is unknown and predicted as none; a robot that is lost may be so by mistake.
         """
         for live in self._live_hypotheses.values():
             pose = se2.compose(live.filter.pose, prediction.fused.increment)

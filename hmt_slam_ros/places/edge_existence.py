@@ -62,7 +62,7 @@ def classify_pieces(along: Float64, ahead: Float64, back: Float64, length: float
 
 
 def update_existence(existence: Existence, observed: int, features: FeatureParameters) -> Existence:
-    """Existence of a piece after an observation; a removed one that is free exists anew."""
+    """Existence of a piece after an observation; a removed one that is free exists again."""
     if observed == _BLOCKED:
         return existence.update_on_miss(features)
     if observed == _UNSEEN:

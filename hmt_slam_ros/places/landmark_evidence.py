@@ -36,7 +36,7 @@ class LoopProposer:
 
     def __init__(self, configuration: Configuration, views: AreaViewCache) -> None:
         self._loops, self._views = AreaLoopDetector(configuration, views), views
-        # Areas with a position known this well, m, are told apart by the arcs, or searched in any case.
+        # Areas with a position known this well, m, are distinguished by the arcs, or searched in any case.
         self._max_arc_deviation = min(configuration.places.spacing, configuration.tsbi.prior_limit)
         self._unreported: list[AreaLoop] = []
         self._reported: set[tuple[int, int]] = set()
@@ -131,7 +131,7 @@ class PlaceEvidence:
         """Notices of what was proposed since the last call."""
         return [] if self.loops is None else self.loops.notices()
 
-    def localized(self) -> None:
+    def on_localized(self) -> None:
         """Drop the views that only the prior needs, once the robot is localized."""
         if self.loops is None:
             self.views.clear()

@@ -52,7 +52,7 @@ TRANSITIONS = 3
 """Transitions in a row in which both peaks have to move in the same way (section 3.5)."""
 
 _SLIP = 1e-9
-"""Slip of the belief: larger ones would start the second peak anew at each transition."""
+"""Slip of the belief: larger ones would restart the second peak at each transition."""
 
 _NODE_RADIUS = 1.0
 """Largest distance of a keyframe from the node that the robot visits there, m."""

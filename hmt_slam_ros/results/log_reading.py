@@ -177,15 +177,15 @@ def describe_log(read: LogProgress, name: str, *, further: bool) -> str:
     return f"{name} is the log that the map was made of, of which {scans} scans are in it: goes on with the next"
 
 
-def describe_parameter_changes(saved: Configuration, asked: Configuration, *, further: bool = False) -> str | None:
+def describe_parameter_changes(saved: Configuration, requested: Configuration, *, further: bool = False) -> str | None:
     """A sentence about the parameters that change when a run continues, None where none changes.
 
     :param saved: configuration of the map.
-    :param asked: configuration of the run.
+    :param requested: configuration of the run.
     :param further: whether the log is a further one, so that ``robot.start`` may change.
     :raises HmtSlamError: where a fixed parameter changes.
     """
-    before, now = as_flat(saved), as_flat(asked)
+    before, now = as_flat(saved), as_flat(requested)
     changed = [name for name in before if before[name] != now[name]]
     fixed = [name for name in changed if name in FIXED_PARAMETERS or (name == _START and not further)]
     if fixed:

@@ -126,7 +126,7 @@ class DoctorNode(Node):
         return tuple(name for name in self.get_node_names() if name != self.get_name())
 
     def request_parameters(self) -> None:
-        """Request the relevant parameters of every node that was not asked before."""
+        """Request the relevant parameters of every node that has not been requested before."""
         for name, namespace in self.get_node_names_and_namespaces():
             full = f"{namespace.rstrip('/')}/{name}"
             if full in self._parameter_futures or name == self.get_name():

@@ -195,7 +195,7 @@ class RecoveredState:
     :ivar checkpoint_folder: folder of the checkpoint.
     :ivar outputs: the last ones before the journal.
     :ivar inputs: the journal's, in their order.
-    :ivar was_active: whether the node was active when it was killed, None where it had never been told.
+    :ivar was_active: whether the node was active when it was killed, None before the first lifecycle transition.
     """
 
     header: JournalHeader

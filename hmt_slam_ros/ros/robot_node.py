@@ -99,7 +99,7 @@ class DrivenRobotSource:
         node.create_subscription(Twist, CMD_VEL, self._on_command, topics.NEWEST)
 
     def records(self) -> Iterator[LogRecord]:
-        """The measurements of the robot, each simulated when it is asked for."""
+        """The measurements of the robot, each simulated on demand."""
         for record in self._log.records():
             if isinstance(record.measurement, Odometry):
                 self._true_poses.append((record.measurement.stamp, self._robot.pose))

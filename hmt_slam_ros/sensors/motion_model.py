@@ -268,7 +268,7 @@ class Inertia:
         residual = mean / state.last_interval - state.velocity
         weighted = measured @ residual
         if float(residual @ weighted - weighted @ covariance @ weighted) > _JUMP**2:
-            # One of the two poses was wrong, or the robot was carried: its velocity is unknown.
+            # One of the two poses was wrong, or the robot was kidnapped: its velocity is unknown.
             self.state = replace(state, velocity=np.zeros(3), covariance=matrix_inverse(self._prior_information))
         else:
             self.state = replace(state, velocity=state.velocity + covariance @ weighted, covariance=covariance)

@@ -140,7 +140,7 @@ class PreparedScan:
         """Surfels for matching with a grid, shape (n, 4), base frame."""
         return self._mapping.matching_surfels(self.scan)
 
-    def derived(self, make: Callable[[Scan, Configuration], T]) -> T:
+    def derive(self, make: Callable[[Scan, Configuration], T]) -> T:
         """The value that a function derives from the scan."""
         if make not in self._derived:
             self._derived[make] = make(self.scan, self._mapping.configuration)

@@ -197,7 +197,7 @@ class Branching:
         """Free what served global localization."""
         self.search.end_global_localization()
         if self.landmarks is not None:
-            self.landmarks.localized()
+            self.landmarks.on_localized()
 
     def forget_scans(self) -> None:
         """Drop what was computed from scans, of which some have changed."""

@@ -1,8 +1,8 @@
 """Global localization: Eq. (6) with a prior that is flat over all known areas.
 
-Blanco et al. name robot awakening as future work: a topological loop closure whose prior is uninformative. All
-keyframes since the robot was lost are matched into every area, at all positions in its place and all headings. Each
-search computes the probabilities again from the same prior, so every scan counts once.
+Blanco et al. name global localization ("robot awakening") as future work: a topological loop closure whose prior is
+uninformative. All keyframes since the robot was lost are matched into every area, at all positions in its place and
+all headings. Each search computes the probabilities again from the same prior, so every scan counts once.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def localize_globally(
     wall_rate = max(WALLS_OUTLIER_RATE, _OLD_MAP_FACTOR * clutter.wall_outlier_rate)
     for n in np.flatnonzero(_probabilities(log_weights) >= _MIN_WALL_CHECK_PROBABILITY):
         walls = matcher.check_walls(hybrid_map, candidates[n], poses, before)
-        # Walls without violations repeat what the surfaces said, so they only count against a candidate.
+        # Walls without violations add nothing to the surfaces, so they only count against a candidate.
         log_weights[n] += min(0.0, WALLS_OF_MAP.log_likelihood_ratio(walls, wall_rate))
     return PoseDistribution(tuple(candidates), _probabilities(log_weights))
 
@@ -242,7 +242,7 @@ class LandmarkEvidence(Protocol):
         """Notices of the loops proposed since the last call."""
         ...
 
-    def localized(self) -> None:
+    def on_localized(self) -> None:
         """Free what served global localization, which has ended."""
         ...
 

@@ -320,7 +320,7 @@ def normalize_and_reduce(
 class LocalizedHypothesis:
     """The map of a hypothesis, and the robot's pose in it, to be compared with another hypothesis.
 
-    Over known ground, hypotheses differ in the area by which they enter it, or in the mode of one match. They claim the
+    Over known ground, hypotheses differ in the area by which they enter it, or in the mode of one match. They state the
     same topology if their maps would agree after fine alignment.
 
     :ivar area: the robot's area.
@@ -352,7 +352,7 @@ class LocalizedHypothesis:
     def is_equivalent(self, other: LocalizedHypothesis) -> bool:
         """Whether both have the same robot pose in all common areas around it, and close the same loops.
 
-        A closure is a claim of its own, even where the arcs alone imply it.
+        A closure is a statement of its own, even where the arcs alone imply it.
         """
         if bool(self.closures) != bool(other.closures) or self.removed_arcs != other.removed_arcs:
             return False

@@ -4,7 +4,7 @@ A lost robot maps around itself. It begins a new area, to which an uninformative
 are searched in the whole map, again and again. A pose is accepted with enough probability in two searches in a row, or
 in one that agrees with a pose hint. Then a child closes the loop between the two maps, and TLCA decides on it.
 
-Kidnapping: odometry can fail (slip, lost readings, a carried robot). The scans then contradict the submap, from which
+Kidnapping: odometry can fail (slip, lost readings, a kidnapped robot). The scans then contradict the submap, from which
 a CUSUM test gives the log-odds (``HypothesisState.kidnapping_test``). If they suffice, a kidnapped child is spawned,
 whose keyframes since the kidnapping begin a new area.
 """
