@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Make the pictures of README.md and docs/guides/tutorial.md anew, from runs; and all in docs/images small.
+"""Draw the pictures of README.md and docs/guides/tutorial.md from runs, and reduce all files in docs/images.
 
-docs/images/malaga_map.png is the map of the bundled log, twins_pmf.png the probabilities of a simulated drive through
-two rooms that are alike. worlds.png, view.png and concept_*.svg have scripts of their own, which this one runs.
-view.png needs a browser: without one the old picture stays.
+malaga_map.png is the map of the bundled log, twins_pmf.png the probabilities of a simulated drive through two identical
+rooms. worlds.png, view.png and concept_*.svg have separate scripts, which this one runs. view.png needs a browser: the
+old picture stays without one.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def draw(log: str, picture: str, width: int, to: Path) -> None:
 
 
 def reduce(path: Path) -> None:
-    """Keep the nearest of a few colors, which nobody sees and a repository feels; only where that is smaller."""
+    """Reduce the colors of a picture, if that makes the file smaller."""
     before = path.stat().st_size
     with Image.open(path) as image:
         if image.mode == "P":

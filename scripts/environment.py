@@ -1,4 +1,4 @@
-"""Make the virtual environment in which the tests and the demonstration run, and keep it up to date.
+"""Make the virtual environment for tests and the demonstration, and keep it up to date.
 
 Where a Jazzy is sourced, its packages are used and only what it lacks is installed. Elsewhere a real rclpy comes from
 PyPI, and tf2_msgs, of which PyPI has no wheel, is compiled from scripts/tf2_msgs. Nothing but the standard library is
@@ -26,7 +26,7 @@ REQUIREMENTS = ROOT / "requirements"
 
 
 class EnvironmentSetupError(Exception):
-    """What hinders the environment, in one sentence that names the remedy."""
+    """An error of the setup, in one sentence with the remedy."""
 
 
 @dataclass
@@ -49,14 +49,14 @@ class Environment:
         return self.path / "bin" / "python"
 
     def stamp(self, step: str) -> Path:
-        """The file that holds the fingerprint of what a step was last done with."""
+        """The file with the fingerprint of the last inputs of a step."""
         return self.path / f"{step}.stamp"
 
-    def stamped(self, step: str, wanted: str) -> bool:
-        """Return whether a step was done with what has this fingerprint."""
+    def is_up_to_date(self, step: str, wanted: str) -> bool:
+        """Whether the last inputs of a step have a fingerprint."""
         return self.python.exists() and self.stamp(step).is_file() and self.stamp(step).read_text() == wanted
 
-    def say(self, text: str) -> None:
+    def report_progress(self, text: str) -> None:
         """Print a line of progress with the seconds since the start."""
         print(f"[{time.monotonic() - self.started:4.0f} s] {text}", file=sys.stderr, flush=True)
 
@@ -132,7 +132,7 @@ def create(environment: Environment) -> None:
     settings = environment.path / "pyvenv.cfg"
     if environment.python.exists() and settings.is_file() and all(part in settings.read_text() for part in wanted):
         return
-    environment.say(f"creating {environment.path.name} with Python {version}")
+    environment.report_progress(f"creating {environment.path.name} with Python {version}")
     shutil.rmtree(environment.path, ignore_errors=True)
     environment.path.mkdir()
     environment.run(
@@ -145,7 +145,7 @@ def create(environment: Environment) -> None:
 
 def install_project(environment: Environment) -> None:
     """Install the project, so that its modules are used where they lie, with all that it and its tests need."""
-    environment.say("installing hmt_slam_ros with numpy, scipy, numba and the tools of the tests")
+    environment.report_progress("installing hmt_slam_ros with numpy, scipy, numba and the tools of the tests")
     environment.install("--editable", f"{ROOT}[test]", problem="pip could not install hmt_slam_ros; is PyPI in reach?")
 
 
@@ -153,13 +153,13 @@ def install_ros(environment: Environment) -> None:
     """Install rclpy and the message packages, unless Jazzy is sourced."""
     if environment.jazzy:
         return
-    environment.say("installing rclpy (ROS 2 Jazzy) from PyPI")
+    environment.report_progress("installing rclpy (ROS 2 Jazzy) from PyPI")
     environment.install("-r", REQUIREMENTS / "ros.txt", problem="pip could not install rclpy; is PyPI in reach?")
     missing = missing_for_compilation()
     if missing:
-        environment.say(f"tf2_msgs is left out and /tf stays silent: {missing} and run this again")
+        environment.report_progress(f"tf2_msgs is left out and /tf stays silent: {missing} and run this again")
     else:
-        environment.say("compiling tf2_msgs, for /tf")
+        environment.report_progress("compiling tf2_msgs, for /tf")
         build_tf2_msgs(environment)
 
 
@@ -218,14 +218,14 @@ def update(environment: Environment) -> None:
         "project": (digest(REQUIREMENTS, ROOT / "setup.py", ROOT / "setup.cfg", also=needs), install_project),
         "ros": (digest(REQUIREMENTS, TF2_MSGS, also=needs), install_ros),
     }
-    if all(environment.stamped(name, wanted) for name, (wanted, _) in steps.items()):
+    if all(environment.is_up_to_date(name, wanted) for name, (wanted, _) in steps.items()):
         return
     create(environment)
     for name, (wanted, install) in steps.items():
-        if not environment.stamped(name, wanted):
+        if not environment.is_up_to_date(name, wanted):
             install(environment)
             environment.stamp(name).write_text(wanted)
-    environment.say(f"{environment.path.name} is ready")
+    environment.report_progress(f"{environment.path.name} is ready")
 
 
 def main() -> int:

@@ -55,12 +55,12 @@ def test_the_fingerprint_follows_contents_names_and_the_remark(environment_modul
 
 
 def test_a_step_is_done_again_when_its_fingerprint_changes_or_the_interpreter_is_gone(environment):
-    assert not environment.stamped("ros", "abc")
+    assert not environment.is_up_to_date("ros", "abc")
     environment.stamp("ros").write_text("abc")
-    assert environment.stamped("ros", "abc")
-    assert not environment.stamped("ros", "abcd")
+    assert environment.is_up_to_date("ros", "abc")
+    assert not environment.is_up_to_date("ros", "abcd")
     environment.python.unlink()
-    assert not environment.stamped("ros", "abc")
+    assert not environment.is_up_to_date("ros", "abc")
 
 
 def test_a_step_that_fails_names_the_purpose_the_cause_and_the_log(environment, environment_module):

@@ -1,0 +1,1 @@
+"""The pictures of docs/concepts, drawn by scripts/draw_concepts.py."""
