@@ -1,7 +1,7 @@
 """The command line of the measurements: ``python -m benchmark KIND [KIND ...]``, with ``all`` for those on real logs
 and ``validation`` for those on simulated worlds.
 
-Exit status: 0 where all that is asked for holds, 1 where something does not, 2 where nothing could be measured.
+Exit status: 0 where all requirements are met, 1 where one is not, 2 where the measurement failed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,15 @@ from importlib import import_module
 from pathlib import Path
 
 from benchmark.logs import LOGS, ROOT
-from benchmark.report import ACCURACY, VALIDATION, Report, circumstances, shown, summary, write_between_marks
+from benchmark.report import (
+    ACCURACY,
+    VALIDATION,
+    Report,
+    copy_illustrations,
+    describe_circumstances,
+    summarize_circumstances,
+    write_between_marks,
+)
 from benchmark.runs import Runner
 from benchmark.settings import Settings
 from benchmark.simulated.records import Records
@@ -38,13 +46,13 @@ MEASUREMENTS = {
     "institute": "missions and global localization over places in an institute",
     "threeloops": "loop closures that only the belief over places proposes",
     "explore": "exploration of an institute, and missions to its rooms",
-    "pilot": "errands of the pilot through nodes in an explored institute",
+    "pilot": "tasks of the pilot through nodes in an explored institute",
     "policies": "areas that end at doors, and portals against true doors",
-    "ambiguity": "hypotheses in identical places until the evidence tells them apart",
+    "ambiguity": "hypotheses in identical places until the evidence separates them",
     "table": "time and memory against a global metric RBPF at equal accuracy (Table II)",
     "oracle": "TSBI's PMF against an exact enumeration of all topologies",
     "awakening": "global localization in a saved map",
-    "kidnapping": "recovery of a robot that is carried while it drives",
+    "kidnapping": "recovery of a robot that is kidnapped while it drives",
     "laps": "memory, cost and errors over repeated laps on known ground",
     "changes": "maps of changing worlds in mode lifelong, among people",
     "scale": "time and memory in maps of up to 100,000 areas",
@@ -80,20 +88,20 @@ _GROUPS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, write the reports, say what holds; return the exit status."""
-    options = _parser().parse_args(arguments)
+    """Measure and write the reports; return the exit status."""
+    options = _make_parser().parse_args(arguments)
     try:
         reports = _measure(options)
     except HmtSlamError as fault:
         print(f"benchmark: {fault}", file=sys.stderr)
         return FAULT
-    return 0 if all(report.met for report in reports) else UNMET
+    return 0 if all(report.is_met for report in reports) else UNMET
 
 
 def _measure(options: argparse.Namespace) -> list[Report]:
     if options.write_docs and (options.set or options.logs or options.training):
         raise HmtSlamError("--write-docs is for the whole measurement: leave --set and --logs away, and --training")
-    out = _folder(options)
+    out = _create_report_folder(options)
     runner = Runner(out / "runs", options.jobs)
     changes, seeds = tuple(options.set), tuple(range(options.seeds))
     records = Records(options.runs or out / "runs", options.jobs)
@@ -101,26 +109,28 @@ def _measure(options: argparse.Namespace) -> list[Report]:
         options.logs, seeds, changes, out, options.write_expected, runner, records, options.training, options.minutes
     )
     reports = []
-    for kind in _kinds(options):
+    for kind in _list_kinds(options):
         module = import_module(f"benchmark.{_MODULES.get(kind, kind)}")
         report: Report = getattr(module, f"measure_{kind}")(settings)
-        facts = circumstances(report.seeds, options.jobs, options.set)
+        facts = describe_circumstances(report.seeds, options.jobs, options.set)
         report.write(out, facts)
         if options.write_docs:
             document = VALIDATION if kind in _GROUPS["validation"] else ACCURACY
-            write_between_marks(document, kind, f"{summary(facts)}\n\n{report.text}{shown(report, out)}")
+            write_between_marks(
+                document, kind, f"{summarize_circumstances(facts)}\n\n{report.text}{copy_illustrations(report, out)}"
+            )
         print(f"\n# {report.title}\n\n{report.text}\n\n{out / f'{kind}.md'}", flush=True)
         reports.append(report)
     return reports
 
 
-def _kinds(options: argparse.Namespace) -> tuple[str, ...]:
-    chosen = [kind for name in options.measurements for kind in _GROUPS.get(name, (name,))]
-    return tuple(dict.fromkeys(chosen))
+def _list_kinds(options: argparse.Namespace) -> tuple[str, ...]:
+    kinds = [kind for name in options.measurements for kind in _GROUPS.get(name, (name,))]
+    return tuple(dict.fromkeys(kinds))
 
 
-def _folder(options: argparse.Namespace) -> Path:
-    """The empty folder of the report."""
+def _create_report_folder(options: argparse.Namespace) -> Path:
+    """The empty folder of the report, which is created."""
     chosen: Path | None = options.out
     if chosen is None:
         name = f"{datetime.now(UTC).date()}-{'-'.join(options.measurements)}"
@@ -132,47 +142,51 @@ def _folder(options: argparse.Namespace) -> Path:
     return chosen
 
 
-def _parser() -> argparse.ArgumentParser:
+def _make_parser() -> argparse.ArgumentParser:
     parser = OneSentenceParser(
         prog="python -m benchmark",
         description="Measurements of hmt_slam_ros on recorded and simulated logs.",
-        epilog=_told(),
+        epilog=_describe_kinds(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("measurements", nargs="+", choices=(*MEASUREMENTS, *_GROUPS), metavar="KIND", help="see below")
     names = ", ".join((*LOGS, *FAMILIES, INSTITUTE, LONG, CAMPUS))
-    parser.add_argument("--logs", type=_names, default=(), metavar="A,B", help=f"of {names}")
-    parser.add_argument("--seeds", type=_count, default=0, metavar="N", help="seeds 0 to N-1; simulated: from 1000")
-    parser.add_argument("--jobs", type=_count, default=2, metavar="N", help="runs at the same time; 1 for speed")
+    parser.add_argument("--logs", type=_parse_names, default=(), metavar="A,B", help=f"of {names}")
+    parser.add_argument(
+        "--seeds", type=_parse_count, default=0, metavar="N", help="seeds 0 to N-1; simulated: from 1000"
+    )
+    parser.add_argument("--jobs", type=_parse_count, default=2, metavar="N", help="runs at the same time; 1 for speed")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report")
-    parser.add_argument("--runs", type=Path, metavar="DIR", help="keeps simulated runs and awakenings, to go on from")
-    parser.add_argument("--minutes", type=_minutes, default=60.0, metavar="M", help="how long soak runs")
+    parser.add_argument("--runs", type=Path, metavar="DIR", help="keeps simulated runs and starts, for later calls")
+    parser.add_argument("--minutes", type=_parse_minutes, default=60.0, metavar="M", help="how long soak runs")
     parser.add_argument("--training", action="store_true", help="simulated worlds of seeds 0 to N-1")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="set one parameter")
-    parser.add_argument("--write-expected", action="store_true", help="put what short measures on record")
+    parser.add_argument("--write-expected", action="store_true", help="record the figures of short or identity")
     parser.add_argument("--write-docs", action="store_true", help="put the tables into docs/")
     return parser
 
 
-def _told() -> str:
-    """The kinds of measurements and their groups, one a line."""
+def _describe_kinds() -> str:
+    """The kinds of measurements and their groups, one on each line."""
     kinds = [f"  {name:<12} {text}" for name, text in MEASUREMENTS.items()]
     groups = [f"  {name:<12} {', '.join(kinds)}" for name, kinds in _GROUPS.items()]
     return "\n".join(["kinds:", *kinds, "", "groups of kinds:", *groups])
 
 
-def _names(text: str) -> tuple[str, ...]:
+def _parse_names(text: str) -> tuple[str, ...]:
     return tuple(text.split(","))
 
 
-def _minutes(text: str) -> float:
+def _parse_minutes(text: str) -> float:
     minutes = float(text)
     if not minutes >= _LEAST_MINUTES:
-        raise argparse.ArgumentTypeError(f"{text} tells nothing of memory: give {_LEAST_MINUTES:g} minutes or more")
+        raise argparse.ArgumentTypeError(
+            f"{text} minutes are too few for the growth of memory: give {_LEAST_MINUTES:g} or more"
+        )
     return minutes
 
 
-def _count(text: str) -> int:
+def _parse_count(text: str) -> int:
     count = int(text)
     if count < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")

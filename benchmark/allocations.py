@@ -24,7 +24,7 @@ PACKAGES = (
     "registration.match_covariance",
     "submap",
 )
-"""Whose kernels run for every scan, for every particle and for every beam."""
+"""Packages with kernels that run for every scan, particle or beam."""
 
 ARRAYS = {
     "geometry.covariance.propagate_covariance": (2, "the result, half of the product"),
@@ -42,32 +42,35 @@ ARRAYS = {
     "grids.insertion.cell_coordinates": (1, "the results for all particles"),
     "submap.local_mapping._split_at_range": (7, "the results, distances and what leads to them"),
     "registration.scan_to_map.align": (2, "the results"),
-    "registration.dynamic_rejection.reject_dynamic": (9, "the result, what each thing tells, those in doubt"),
+    "registration.dynamic_rejection.reject_dynamic": (
+        9,
+        "the result, equations of each segment, candidates for rejection",
+    ),
     "registration.correlative_search.correlative_search": (5, "the result, scores, a pose, the cells of the points"),
 }
-"""{kernel: (arrays that a call makes at most, what they are)}; all others make none."""
+"""{kernel: (largest number of arrays of a call, their names)}; all others make none."""
 
 Counts = dict[str, list[int]]
 
 
 @contextmanager
-def counted(packages: Sequence[str] = PACKAGES) -> Iterator[Counts]:
-    """Count what every call of a kernel from outside of kernels takes, with all that it calls itself.
+def count_allocations(packages: Sequence[str] = PACKAGES) -> Iterator[Counts]:
+    """Count the allocations of every call of a kernel from Python, including the kernels that it calls.
 
-    numba's own count has one block for every array that is handed over; that is not the kernel's doing, and left out.
-    What is called has to be compiled before, for a kernel that counts cannot be compiled into another one.
+    numba counts one block for every array argument, which is subtracted. Kernels have to be compiled before, because a
+    counting kernel cannot be compiled into another one.
 
-    :param packages: of ``hmt_slam_ros``, whose kernels are meant.
+    :param packages: of ``hmt_slam_ros``, whose kernels are counted.
     :returns: {kernel: allocations of each call}, which grows while the context is open.
     """
     counts: Counts = {}
     replaced = []
     for module in [module for name, module in sys.modules.items() if name.startswith("hmt_slam_ros.")]:
         for name, value in list(vars(module).items()):
-            kernel = _name(value)
+            kernel = _kernel_name(value)
             if kernel.startswith(tuple(f"{package}." for package in packages)):
                 replaced.append((module, name, value))
-                setattr(module, name, _counting(value, counts.setdefault(kernel, [])))
+                setattr(module, name, _wrap_kernel(value, counts.setdefault(kernel, [])))
     enabled = _nrt_python.memsys_stats_enabled()
     _nrt_python.memsys_enable_stats()
     try:
@@ -75,56 +78,56 @@ def counted(packages: Sequence[str] = PACKAGES) -> Iterator[Counts]:
     finally:
         if not enabled:
             _nrt_python.memsys_disable_stats()
-        _put_back(replaced)
+        _restore(replaced)
 
 
-def _put_back(replaced: Sequence[tuple[ModuleType, str, object]]) -> None:
+def _restore(replaced: Sequence[tuple[ModuleType, str, object]]) -> None:
     for module, name, value in replaced:
         setattr(module, name, value)
 
 
-def _name(value: object) -> str:
-    """Module and name of a kernel, without the package; nothing for what is none."""
+def _kernel_name(value: object) -> str:
+    """Module and name of a kernel, without the package; empty for other values."""
     if not isinstance(value, Dispatcher):
         return ""
     return f"{value.py_func.__module__}.{value.py_func.__name__}".removeprefix("hmt_slam_ros.")
 
 
-def _counting(kernel: Callable[..., object], counts: list[int]) -> Callable[..., object]:
+def _wrap_kernel(kernel: Callable[..., object], counts: list[int]) -> Callable[..., object]:
     def call(*arguments: object) -> object:
         begin = rtsys.get_allocation_stats().alloc
         result = kernel(*arguments)
-        counts.append(rtsys.get_allocation_stats().alloc - begin - _arrays(arguments))
+        counts.append(rtsys.get_allocation_stats().alloc - begin - _count_arrays(arguments))
         return result
 
     return call
 
 
-def _arrays(value: object) -> int:
-    """How many arrays there are in what is handed to a kernel."""
+def _count_arrays(value: object) -> int:
+    """The number of arrays in an argument of a kernel."""
     if isinstance(value, tuple):
-        return sum(map(_arrays, value))
+        return sum(map(_count_arrays, value))
     return int(isinstance(value, np.ndarray))
 
 
 def requirements_on(counts: Mapping[str, Sequence[int]]) -> list[Requirement]:
-    """That no kernel takes more than its arrays, whatever the number of beams, particles and steps."""
+    """Requirements that no kernel makes more than its arrays, for any number of beams, particles and steps."""
     return [
-        Requirement(f"{kernel}: arrays of a call", max(taken), ARRAYS.get(kernel, (0, ""))[0])
-        for kernel, taken in sorted(counts.items())
-        if taken
+        Requirement(f"{kernel}: arrays of a call", max(arrays), ARRAYS.get(kernel, (0, ""))[0])
+        for kernel, arrays in sorted(counts.items())
+        if arrays
     ]
 
 
-def told(counts: Mapping[str, Sequence[int]], scans: int) -> tuple[str, dict[str, Any]]:
+def describe_counts(counts: Mapping[str, Sequence[int]], scans: int) -> tuple[str, dict[str, Any]]:
     """The counts as a table and for programs.
 
     :param scans: number of scans that they are from.
     """
     rows, data = [], {}
-    for kernel, taken in sorted(counts.items()):
-        if taken:
-            calls, mean, most = len(taken) / scans, float(np.mean(taken)), max(taken)
+    for kernel, arrays in sorted(counts.items()):
+        if arrays:
+            calls, mean, most = len(arrays) / scans, float(np.mean(arrays)), max(arrays)
             data[kernel] = {"calls_per_scan": calls, "mean": mean, "most": most}
             rows.append([f"`{kernel}`", f"{calls:.2f}", f"{mean:.1f}", str(most), ARRAYS.get(kernel, (0, "none"))[1]])
     return table(["kernel", "calls a scan", "arrays a call", "at most", "which"], rows), data

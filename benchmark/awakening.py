@@ -1,4 +1,4 @@
-"""Global localization in a saved map: distance until the robot is localized, and correctness."""
+"""Robot awakening [B]: global localization in a saved map, by distance and correctness."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from benchmark.logs import opened
+from benchmark.logs import open_logs
 from benchmark.report import Report, Requirement, table
-from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
-from benchmark.simulated.records import Records, code
+from benchmark.simulated.records import Records, code_hash
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs import LogRecord
 from hmt_slam_ros.logs.records import SIMULATION_PREFIX
@@ -38,51 +37,50 @@ from hmt_slam_ros.sensors import Scan
 LOGS = ("aces", "intel")
 WORLDS = ("office", "nested", "grid")
 ALIKE = ("grid",)
-"""Worlds whose every place exists several times, so that where it is cannot be known."""
+"""Worlds in which every place exists several times, so that the pose is ambiguous."""
 
 KINDS = ("whole", "first half")
-"""The maps of a log in which the robot wakes up."""
+"""The maps of a log in which the robot starts."""
 
 STARTS = 100
-"""Places of every log at which the robot wakes up."""
+"""Starts in every log."""
 
 FAR = 20.0
-"""m of travel within which the place is to be known."""
+"""Path within which the robot has to be localized, m."""
 
 SURE = 0.9
 RIGHT_SHARE = 0.95
 
 _RIGHT, _RIGHT_ANGLE = 1.0, math.radians(20.0)
-# m that the robot drives on once it knows its place; steps in which travel is counted, so that noise does not.
+# m that the robot drives on once it is localized; smallest step that counts as travel, m, against noise.
 _ON, _STEP = 5.0, 0.1
-# The log's last part is left out: a drive that ends says nothing of 20 m.
+# Last part of the log that is left out, because the drive ends before 20 m.
 _LAST = 0.05
-# A map holds a place where one of its keyframes was taken so near, m, and a start that much of the way from there, m.
+# Largest distance of a keyframe to a place that a map contains, m, and path from a start that has to be contained, m.
 _HELD, _HELD_WAY = 2.0, 10.0
 _DRAWS = 2008
 
 POLICY = (
-    "The robot wakes up at scans drawn from a log and drives on as it did, in one of two maps. That of the whole log "
-    "holds the very scans that it sees, which is easy. That of the log's first half, in simulation the first of two "
-    "laps, is of another time: the robot wakes up in the second half, where a keyframe of the first was taken within "
-    f"{_HELD:g} m all along the first {_HELD_WAY:g} m of its way; after that it may leave the map. "
-    "ACES has no such place. "
-    f"It says that it knows its place when the hypotheses in which it is not lost have a probability of {SURE:g}, and "
-    f"drives on for {_ON:g} m then, else {FAR:g} m in all. That is right within {_RIGHT:g} m and "
-    f"{math.degrees(_RIGHT_ANGLE):.0f} degrees of where the run over the whole log has this scan, relative to the "
-    "nearest keyframe of the map. A confident wrong answer is one that is off by more at any time after it was known. "
-    "In grid every place exists several times, so that only wrong answers are asked for."
+    "The robot starts at random scans of a log without an initial pose, and repeats the drive of the log in one of two "
+    "maps. The map of the whole log contains the very scans of the drive, which is easy. The map of the log's first "
+    "half (in simulation, the first of two laps) is of another time: the robot starts in the second half, if a "
+    f"keyframe of the first is within {_HELD:g} m all along the first {_HELD_WAY:g} m of its path; after that it may "
+    "leave the map. ACES has no such place. The robot is localized if the hypotheses that are not lost have a "
+    f"probability of {SURE:g}. It then drives {_ON:g} m more, else {FAR:g} m in all. Its pose is right within "
+    f"{_RIGHT:g} m and {math.degrees(_RIGHT_ANGLE):.0f} degrees of the pose of this scan in the run over the whole "
+    "log, relative to the nearest keyframe of the map. A confident wrong answer is a larger error at any time after "
+    "the localization. In grid every place exists several times, so that only wrong answers count."
 )
 
 
 @dataclass(frozen=True)
 class Awakening:
-    """What came of one start.
+    """The outcome of one start.
 
     :ivar start: number of the record.
-    :ivar found: m of travel until the robot said that it knows its place; inf where it never did.
-    :ivar right: whether it was right at the end of the travel.
-    :ivar wrong: whether it was sure of a wrong place at any time.
+    :ivar found: path until the robot was localized, m; inf if it never was.
+    :ivar right: whether its pose was right at the end of the path.
+    :ivar wrong: whether it was localized at a wrong place at any time.
     """
 
     start: int
@@ -92,20 +90,20 @@ class Awakening:
 
     @property
     def good(self) -> bool:
-        """Whether it was right in time."""
+        """Whether the robot was localized in time, and never wrongly."""
         return self.right and not self.wrong and self.found <= FAR
 
 
 @dataclass(frozen=True, eq=False)
-class Mapped:
-    """A saved map, and what is known of a drive through it.
+class MappedLog:
+    """A saved map, and a drive through it with its truth.
 
     :ivar configuration: of the runs.
     :ivar records: of the log.
-    :ivar state: what was saved.
+    :ivar state: the saved map.
     :ivar scans: shape (n,), numbers of the records that are scans.
     :ivar truth: shape (n, 3), ``map_T_base`` of these.
-    :ivar starts: numbers of scans at which the robot may wake up.
+    :ivar starts: numbers of scans at which the robot may start.
     """
 
     configuration: Configuration
@@ -117,71 +115,77 @@ class Mapped:
 
 
 def measure_awakening(settings: Settings) -> Report:
-    """Map the logs, and wake up in them."""
-    report = Report("awakening", "Waking up in a saved map", seeds=(0,))
-    configuration = load_configuration(PARAMETERS, list(settings.changes))
+    """Map the logs, and localize the robot from starts in them."""
+    report = Report("awakening", "Global localization in a saved map", seeds=(0,))
+    configuration = settings.configuration
     names = settings.logs_or((*LOGS, *WORLDS))
     rows = []
-    with opened([name for name in names if name not in WORLDS]) as logs:
+    with open_logs([name for name in names if name not in WORLDS]) as logs:
         paths: dict[str, Path | str] = {name: f"{SIMULATION_PREFIX}{name},laps=2" for name in names if name in WORLDS}
         paths |= {log.name: log.path for log in logs}
         count, records = len(settings.seeds_or(STARTS)), settings.records
         for name in names:
-            for kind, found in made_starts(name, paths[name], configuration, settings.changes, count, records).items():
-                rows.append(_row(name, kind, found))
-                report.data[f"{name}, {kind}"] = [asdict(one) for one in found]
+            for kind, found in complete_starts(
+                name, paths[name], configuration, settings.changes, count, records
+            ).items():
+                rows.append(_starts_row(name, kind, found))
+                report.data[f"{name}, {kind}"] = [asdict(start) for start in found]
                 if found:
-                    report.requirements += requirements(f"{name}, map of the {kind}", found, asked=name not in ALIKE)
+                    report.requirements += requirements(
+                        f"{name}, map of the {kind}", found, is_distinguishable=name not in ALIKE
+                    )
     columns = ["log", "map of the", "starts", f"right within {FAR:g} m", "m until known, mean", "median", "most"]
     report.body += [table([*columns, "wrong", "not known"], rows), POLICY]
     return report
 
 
-def made_starts(
+def complete_starts(
     name: str, path: Path | str, configuration: Configuration, changes: Sequence[str], count: int, records: Records
 ) -> dict[str, list[Awakening]]:
-    """The first starts in each map of a log, of which those are made that are not there.
+    """The first starts in each map of a log; missing ones are made.
 
-    :param changes: by which the configuration differs from the file.
+    :param changes: parameters of the configuration that differ from the file.
     """
-    kept = Kept(records.folder / f"awakening-{name}-{_known_by(changes)}.json")
-    kept.complete(path, configuration, count, records.jobs)
-    return kept.starts(count)
+    file = StartsFile(records.folder / f"awakening-{name}-{_fingerprint(changes)}.json")
+    file.complete(path, configuration, count, records.jobs)
+    return file.starts(count)
 
 
-def requirements(name: str, found: Sequence[Awakening], *, asked: bool) -> list[Requirement]:
-    """What is asked for of the starts in one map.
+def requirements(name: str, found: Sequence[Awakening], *, is_distinguishable: bool) -> list[Requirement]:
+    """Requirements on the starts in one map.
 
-    :param asked: whether the places can be told apart.
+    :param is_distinguishable: whether the places differ.
     """
-    wrong = Requirement(f"{name}: confident wrong answers", sum(one.wrong for one in found), 0)
-    share = float(np.mean([one.good for one in found]))
+    wrong = Requirement(f"{name}: confident wrong answers", sum(start.wrong for start in found), 0)
+    share = float(np.mean([start.good for start in found]))
     right = Requirement(f"{name}: right within {FAR:g} m", share, 1.0, least=RIGHT_SHARE)
-    return [right, wrong] if asked else [wrong]
+    return [right, wrong] if is_distinguishable else [wrong]
 
 
-def mapped(path: Path | str, configuration: Configuration) -> dict[str, Mapped]:
-    """The maps of a whole log and of its first half, {how it is called: that}."""
+def map_log(path: Path | str, configuration: Configuration) -> dict[str, MappedLog]:
+    """The maps of a whole log and of its first half, {kind: map}."""
     records = list(open_log(path).records())
     scans = np.array([n for n, record in enumerate(records) if isinstance(record.measurement, Scan)])
     middle, last = len(scans) // 2, int((1.0 - _LAST) * len(scans))
-    half = _read(LockStepRun(configuration), records[: scans[middle]]).state
-    run = _read(LockStepRun(configuration, state=half), records[scans[middle] :])
+    half = _process_records(LockStepRun(configuration), records[: scans[middle]]).state
+    run = _process_records(LockStepRun(configuration, state=half), records[scans[middle] :])
     whole, result = run.state, run.finish()
     truth = result.recorder.finish(result.log_progress.stamps).trajectory
     numbers = {records[scan].measurement.stamp: n for n, scan in enumerate(scans)}
-    placed = {numbers[stamp]: pose for stamp, pose in _keyframes(half).items()}
-    known, poses = np.array(list(placed)), np.array(list(placed.values()))
-    away, nearest = cKDTree(truth[known, :2]).query(truth[:, :2])
-    in_half = se2.compose(poses[nearest], se2.between(truth[known[nearest]], truth))
-    travel = np.array(list(_travelled(truth)))
+    pose_of_scan = {numbers[stamp]: pose for stamp, pose in _keyframes(half).items()}
+    known_scans, poses = np.array(list(pose_of_scan)), np.array(list(pose_of_scan.values()))
+    distances, nearest = cKDTree(truth[known_scans, :2]).query(truth[:, :2])
+    in_half = se2.compose(poses[nearest], se2.between(truth[known_scans[nearest]], truth))
+    travel = np.array(list(_path_lengths(truth)))
     ends = np.searchsorted(travel, travel + _HELD_WAY)
-    held = [n for n in range(middle, last) if (away[n : ends[n]] <= _HELD).all()]
-    easy = Mapped(configuration, records, whole, scans, truth, range(last))
-    return dict(zip(KINDS, (easy, Mapped(configuration, records, half, scans, in_half, held)), strict=True))
+    starts_in_half = [n for n in range(middle, last) if (distances[n : ends[n]] <= _HELD).all()]
+    easy = MappedLog(configuration, records, whole, scans, truth, range(last))
+    return dict(
+        zip(KINDS, (easy, MappedLog(configuration, records, half, scans, in_half, starts_in_half)), strict=True)
+    )
 
 
-def _read(run: LockStepRun, records: Sequence[LogRecord]) -> LockStepRun:
+def _process_records(run: LockStepRun, records: Sequence[LogRecord]) -> LockStepRun:
     for record in records:
         run.process_record(record)
     return run
@@ -199,8 +203,8 @@ def _keyframes(state: RunState) -> dict[int, Float64]:
     }
 
 
-def _travelled(poses: Float64) -> Iterator[float]:
-    """Length of the path up to each pose, shape (n, 3), m."""
+def _path_lengths(poses: Float64) -> Iterator[float]:
+    """Path length up to each of the poses (n, 3), m."""
     total, last = 0.0, poses[0]
     for pose in poses:
         step = math.hypot(*(pose - last)[:2])
@@ -209,10 +213,10 @@ def _travelled(poses: Float64) -> Iterator[float]:
         yield total
 
 
-class Kept:
-    """The starts of a log that were made, in a file, so that a measurement that was stopped goes on from there.
+class StartsFile:
+    """The file of the starts of a log, from which an interrupted measurement continues.
 
-    :ivar file: of lines, each with a start and the map in which it was.
+    :ivar file: with a line for each start: the kind of its map and the fields of :class:`Awakening`.
     """
 
     def __init__(self, file: Path) -> None:
@@ -225,93 +229,96 @@ class Kept:
         return {kind: [Awakening(*row[1:]) for row in rows if row[0] == kind][:count] for kind in KINDS}
 
     def complete(self, path: Path | str, configuration: Configuration, count: int, jobs: int) -> None:
-        """Make the starts that are not there of the first ``count`` in each map."""
-        made = {kind: len(found) for kind, found in self.starts(count).items()}
+        """Make the missing ones of the first ``count`` starts in each map."""
+        made = {kind: len(start) for kind, start in self.starts(count).items()}
         if min(made.values()) >= count:
             return
         self.file.parent.mkdir(parents=True, exist_ok=True)
-        for kind, log in mapped(path, configuration).items():
+        for kind, log in map_log(path, configuration).items():
             drawn = np.random.default_rng(_DRAWS).integers(0, max(1, len(log.starts)), count).tolist()
             starts = [log.starts[n] for n in drawn if log.starts]
-            # Forked with the map, so that none has to load it.
-            with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork"), _begin, (log,)) as pool:
-                for found in pool.map(_awakened, starts[made[kind] :]):
+            # Forked processes share the map.
+            with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork"), _set_log, (log,)) as pool:
+                for start in pool.map(_try_start, starts[made[kind] :]):
                     with self.file.open("a", encoding="utf-8") as target:
-                        target.write(json.dumps([kind, *astuple(found)]) + "\n")
+                        target.write(json.dumps([kind, *astuple(start)]) + "\n")
 
 
-def _known_by(changes: Sequence[str]) -> str:
-    """What the starts of this code, with parameters that differ, are known by."""
-    own = hashlib.sha256("\n".join([code(), *changes]).encode() + Path(__file__).read_bytes())
+def _fingerprint(changes: Sequence[str]) -> str:
+    """A hash of this code and the changed parameters, which names the file of the starts."""
+    own = hashlib.sha256("\n".join([code_hash(), *changes]).encode() + Path(__file__).read_bytes())
     return own.hexdigest()[:16]
 
 
-_LOG: list[Mapped] = []
+_LOG: list[MappedLog] = []
 
 
-def _begin(log: Mapped) -> None:
+def _set_log(log: MappedLog) -> None:
     _LOG.append(log)
 
 
-def _awakened(start: int) -> Awakening:
-    return awakened(_LOG[-1], start)
+def _try_start(start: int) -> Awakening:
+    return try_start(_LOG[-1], start)
 
 
-def awakened(log: Mapped, start: int) -> Awakening:
-    """Wake up at a scan of a drive, and go on from there."""
+def try_start(log: MappedLog, start: int) -> Awakening:
+    """Localize the robot globally at a scan of a drive and the scans after it."""
     run = LockStepRun(log.configuration, state=log.state)
     run.lock_step.feed(PoseReset())
     found, right, wrong = math.inf, False, False
-    travel, first = _travelled(log.truth[start:]), int(log.scans[start])
+    travel, first = _path_lengths(log.truth[start:]), int(log.scans[start])
     counted, n = -_STEP, start
     for record in log.records[first:]:
         run.process_record(record)
         if not isinstance(record.measurement, Scan):
             continue
-        travelled, true = next(travel), log.truth[n]
+        traveled, true = next(travel), log.truth[n]
         n += 1
-        if travelled < counted + _STEP:
+        if traveled < counted + _STEP:
             continue
-        counted = travelled
-        now = _is_right(run, log.state.recorder.global_poses, true) if _known(run) else None
+        counted = traveled
+        now = _is_right(run, log.state.recorder.global_poses, true) if _is_localized(run) else None
         if now is not None:
-            found, right, wrong = min(found, travelled), now, wrong or not now
-        if travelled >= min(FAR, found + _ON):
+            found, right, wrong = min(found, traveled), now, wrong or not now
+        if traveled >= min(FAR, found + _ON):
             break
     return Awakening(start, found, right, wrong)
 
 
-def _known(run: LockStepRun) -> bool:
-    """Whether the robot is sure of its place."""
+def _is_localized(run: LockStepRun) -> bool:
+    """Whether hypotheses that are not lost have the probability ``SURE``."""
     hypotheses = run.recorder.hypotheses
     if not hypotheses:
         return False
-    return sum(leaf.probability for leaf in hypotheses[max(hypotheses)].hypotheses if not leaf.lost) >= SURE
+    return (
+        sum(hypothesis.probability for hypothesis in hypotheses[max(hypotheses)].hypotheses if not hypothesis.lost)
+        >= SURE
+    )
 
 
 def _is_right(run: LockStepRun, before: Sequence[AreaPose], true: Float64) -> bool | None:
-    """Whether the last estimate is near the truth; None where its area became part of another since.
+    """Whether the last estimate is near the truth; None if its area was merged with another since.
 
-    :param before: where the areas of the map were.
+    :param before: poses of the areas in the saved map.
     :param true: ``map_T_base``, shape (3,).
     """
     slam, last = run.lock_step.processes["slam"], run.recorder.last_estimate
     assert isinstance(slam, MetricSlam)
     assert last is not None
     decisions = run.recorder.decisions
-    given = next(
+    global_poses = next(
         (decisions[n].global_poses for n in sorted(decisions, reverse=True) if decisions[n].global_poses), before
     )
-    area = complete_area_poses(slam.replica.maps[slam.replica.best_hypothesis], given).get(last.area)
+    area = complete_area_poses(slam.replica.maps[slam.replica.best_hypothesis], global_poses).get(last.area)
     if area is None:
         return None
-    away = se2.between(true, se2.compose(area.mean, last.pose.mean))
-    return bool(math.hypot(away[0], away[1]) <= _RIGHT and abs(away[2]) <= _RIGHT_ANGLE)
+    error = se2.between(true, se2.compose(area.mean, last.pose.mean))
+    return bool(math.hypot(error[0], error[1]) <= _RIGHT and abs(error[2]) <= _RIGHT_ANGLE)
 
 
-def _row(name: str, kind: str, found: Sequence[Awakening]) -> list[str]:
-    known = [one.found for one in found if one.right]
-    share = f"{np.mean([one.good for one in found]):.2f}" if found else "-"
-    figures = (f"{of(known):.1f}" if known else "-" for of in (np.mean, np.median, max))
-    wrong, never = sum(one.wrong for one in found), sum(math.isinf(one.found) for one in found)
+def _starts_row(name: str, kind: str, found: Sequence[Awakening]) -> list[str]:
+    distances = [start.found for start in found if start.right]
+    share = f"{np.mean([start.good for start in found]):.2f}" if found else "-"
+    figures = (f"{statistic(distances):.1f}" if distances else "-" for statistic in (np.mean, np.median, max))
+    wrong, never = sum(start.wrong for start in found), sum(math.isinf(start.found) for start in found)
     return [name, kind, str(len(found)), share, *figures, str(wrong), str(never)]

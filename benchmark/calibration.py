@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.special import gammainc
 
-from benchmark.report import Report, Requirement, table
-from benchmark.settings import Settings, by_family, chosen_seeds, records_of
-from benchmark.simulated.closures import NEW, NOT_ASKED
+from benchmark.report import Columns, Report, Requirement, mean, table, table_of
+from benchmark.settings import Settings, chosen_seeds, group_by_family, make_records
+from benchmark.simulated.closures import NEW, NOT_EXAMINED
 from benchmark.simulated.records import Record
 
 RUNS = 300
-"""Runs that are asked for at least."""
+"""Smallest number of runs."""
 
 LIMIT = 0.05
 """Largest expected calibration error."""
@@ -28,15 +28,15 @@ BINS = 10
 """Bins of equal width."""
 
 LEAST = 1e-6
-"""Probability that a true answer is taken to have at least: ``tsbi.drop_probability``."""
+"""Smallest probability that counts for a true answer: ``tsbi.drop_probability``."""
 
 _DRAWS = 1000
 
 CONSISTENCY_RUNS = 100
-"""Runs that are asked for at least."""
+"""Smallest number of runs."""
 
 ALLOWED = (2.0, 4.5)
-"""Between which the mean NEES has to be."""
+"""Bounds of the mean NEES."""
 
 COVERED = 7.815
 """Chi-square with 3 degrees of freedom at 95 %."""
@@ -58,110 +58,101 @@ _DPI = 110
 POLICY = (
     "A question is a keyframe event at which TSBI compared keyframes with known areas and one of them fitted. Its "
     "answers are the live hypotheses after the event: their keyframes lie in new ground, or in a known area, at a "
-    "pose. All true answers count as one, false ones as one for each known area; what was not examined is false. "
+    "pose. All true answers count as one, false ones as one for each known area; unexamined answers are false. "
     "Expected calibration error: mean distance between probability and frequency over ten bins of equal width, "
-    "weighted by what is in them; of the most probable answer of each question, and of all answers. Brier score: sum "
-    "of squared errors over the answers. Log score: -log of the probability of the true answer, which is taken to be "
-    f"{LEAST:g} at least. The base rate knows how often new ground is true, and spreads the rest evenly over the "
-    "areas that were examined; the arcs alone are the transition model without a look at any scan. Intervals hold 95 "
-    "% of the values over resampled runs. After a false closure was accepted, later questions are judged in the map as "
-    "it is."
+    "weighted by the number of answers in them; of the most probable answer of each question, and of all answers. "
+    "Brier score: sum of squared errors over the answers. Log score: -log of the probability of the true answer, at "
+    f"least {LEAST:g}. The base rate is the frequency of new ground; its remaining probability is uniform over the "
+    "examined areas. The arcs alone are the transition model without any scan. Intervals hold 95 % of the values over "
+    "resampled runs. After a false closure was accepted, later questions are scored in the map with that closure."
 )
 
 CONSISTENCY_POLICY = (
     "NEES: squared Mahalanobis distance of the truth from a belief over a pose, under its covariance; 3 on average "
-    "where the covariance is right, smaller where it is too large. An area's true frame follows from the keyframe that "
-    "is nearest to its origin. Arcs and the poses of areas in the map are those at the end of the run; RTL's pose, in "
-    "the map and in the frame of the robot's area, is taken every two seconds. What is averaged is the mean of each "
-    "run, for within a run errors depend on each other; "
-    "the mean of 100 independent errors would be between 2.54 and 3.50 in 95 % of the cases. Coverage: share of all "
-    "errors within the 95 % ellipsoid."
+    "for a correct covariance, less for one that is too large. An area's true frame follows from the keyframe nearest "
+    "to its origin. Arcs and the poses of areas in the map are those at the end of the run; RTL's pose, in the map and "
+    "in the frame of the robot's area, is taken every two seconds. Averages are over the means of the runs, because "
+    "errors within a run are dependent; the mean of 100 independent errors would be between 2.54 and 3.50 in 95 % of "
+    "the cases. Coverage: share of all errors within the 95 % ellipsoid."
 )
 
 
 def measure_calibration(settings: Settings) -> Report:
     """Map the worlds and compare the probabilities with the truth."""
-    records = records_of(settings)
+    records = make_records(settings)
     report = Report("calibration", "Calibration of the probabilities", seeds=chosen_seeds(settings))
     events = [event for record in records for event in record["events"]]
-    by_run = [[of_hypotheses(event) for event in record["events"]] for record in records]
-    ours = [each for own in by_run for each in own]
+    by_run = [[forecast_of_hypotheses(event) for event in record["events"]] for record in records]
+    live = [forecast for run in by_run for forecast in run]
     base = new_rate(events)
-    sayings = {
-        "live hypotheses": ours,
-        "arcs alone": [of_arcs(event) for event in events],
-        "base rate": [of_base_rate(event, base) for event in events],
+    forecasts = {
+        "live hypotheses": live,
+        "arcs alone": [forecast_of_arcs(event) for event in events],
+        "base rate": [forecast_of_base_rate(event, base) for event in events],
     }
-    report.requirements += _requirements(len(records), sayings)
-    bounds = interval(by_run, lambda some: of_top(some).error)
+    report.requirements += _requirements(len(records), forecasts)
+    bounds = interval(by_run, lambda some: reliability_of_top(some).error)
+    by_family = {
+        family: [forecast_of_hypotheses(event) for record in own for event in record["events"]]
+        for family, own in group_by_family(records).items()
+    }
+    counts = {family: len(own) for family, own in group_by_family(records).items()}
     report.body += [
-        _scores_table(sayings),
+        table_of([("forecast", lambda row: row[0]), *_COLUMNS], forecasts.items()),
         f"The 95 % interval of the first line's error of the most probable answer is {bounds[0]:.3f} to "
         f"{bounds[1]:.3f}. New ground is a true answer of {100.0 * base:.0f} % of the questions.",
-        _family_table(records),
+        table_of(
+            [("family", lambda row: row[0]), ("runs", lambda row: str(counts[row[0]])), *_COLUMNS], by_family.items()
+        ),
         POLICY,
     ]
-    report.data["forecasts"] = {name: [[each.right, *each.wrong] for each in own] for name, own in sayings.items()}
+    report.data["forecasts"] = {name: [[f.right, *f.wrong] for f in own] for name, own in forecasts.items()}
     report.pictures["reliability.png"] = "Frequency against probability, with 95 % intervals; below, answers in a bin."
-    plot_reliability(
-        settings.out / "reliability.png", {"most probable answer": of_top(ours), "all answers": of_each(ours)}
-    )
+    curves = {"most probable answer": reliability_of_top(live), "all answers": reliability_of_all(live)}
+    plot_reliability(settings.out / "reliability.png", curves)
     return report
 
 
-def _requirements(runs: int, sayings: dict[str, list[Forecast]]) -> list[Requirement]:
-    ours = sayings["live hypotheses"]
-    score = float(np.mean([each.brier for each in ours])) if ours else math.nan
+def _requirements(runs: int, forecasts: dict[str, list[Forecast]]) -> list[Requirement]:
+    live = forecasts["live hypotheses"]
+    score = mean([forecast.brier for forecast in live])
     return [
         Requirement("runs", runs, math.inf, least=RUNS),
-        Requirement("expected calibration error, most probable answer", of_top(ours).error, LIMIT),
-        Requirement("expected calibration error, all answers", of_each(ours).error, LIMIT),
+        Requirement("expected calibration error, most probable answer", reliability_of_top(live).error, LIMIT),
+        Requirement("expected calibration error, all answers", reliability_of_all(live).error, LIMIT),
         *(
-            Requirement(f"Brier score / that of the {name}", _ratio(score, float(np.mean([f.brier for f in own]))), 1.0)
-            for name, own in sayings.items()
-            if own is not ours and own
+            Requirement(f"Brier score / that of the {name}", _ratio(score, mean([f.brier for f in own])), 1.0)
+            for name, own in forecasts.items()
+            if own is not live and own
         ),
     ]
 
 
 def _ratio(score: float, other: float) -> float:
-    """Of two scores; 1 where nobody ever erred."""
+    """The ratio of two scores; 1 if both are 0."""
     return score / other if other else (1.0 if score == 0.0 else math.inf)
 
 
-def _scores_table(sayings: dict[str, list[Forecast]]) -> str:
-    head = ["forecast", "questions", "Brier", "log score [nat]", "most probable is true", "its error", "error, all"]
-    return table(head, [[name, *_cells(own)] for name, own in sayings.items()])
+def _column(cell: Callable[[list[Forecast]], str]) -> Callable[[tuple[str, list[Forecast]]], str]:
+    """The cell of the forecasts of a line, "-" if there are none."""
+    return lambda row: cell(row[1]) if row[1] else "-"
 
 
-def _family_table(records: list[Record]) -> str:
-    head = ["family", "runs", "questions", "Brier", "log score [nat]", "most probable is true", "its error"]
-    head.append("error, all")
-    rows = [
-        [family, str(len(own)), *_cells([of_hypotheses(event) for record in own for event in record["events"]])]
-        for family, own in by_family(records).items()
-    ]
-    return table(head, rows)
-
-
-def _cells(own: Sequence[Forecast]) -> list[str]:
-    if not own:
-        return ["0", *["-"] * 5]
-    return [
-        str(len(own)),
-        f"{np.mean([each.brier for each in own]):.4f}",
-        f"{np.mean([each.surprise for each in own]):.3f}",
-        f"{100.0 * np.mean([each.top[1] for each in own]):.1f} %",
-        f"{of_top(own).error:.3f}",
-        f"{of_each(own).error:.3f}",
-    ]
+_COLUMNS: Columns[tuple[str, list[Forecast]]] = [
+    ("questions", lambda row: str(len(row[1]))),
+    ("Brier", _column(lambda own: f"{mean([forecast.brier for forecast in own]):.4f}")),
+    ("log score [nat]", _column(lambda own: f"{mean([forecast.surprise for forecast in own]):.3f}")),
+    ("most probable is true", _column(lambda own: f"{100.0 * mean([forecast.top[1] for forecast in own]):.1f} %")),
+    ("its error", _column(lambda own: f"{reliability_of_top(own).error:.3f}")),
+    ("error, all", _column(lambda own: f"{reliability_of_all(own).error:.3f}")),
+]
 
 
 class Forecast(NamedTuple):
-    """What somebody says of one question.
+    """The probabilities of the answers to one question.
 
     :ivar right: probability of the true answer.
-    :ivar wrong: of every false one, and of what was not examined.
+    :ivar wrong: of every false answer, and of unexamined ones.
     """
 
     right: float
@@ -179,17 +170,17 @@ class Forecast(NamedTuple):
 
     @property
     def top(self) -> tuple[float, bool]:
-        """Probability of the most probable answer, and whether that is true."""
+        """Probability of the most probable answer, and whether it is true."""
         return max(self.right, *self.wrong), self.right >= max(self.wrong)
 
     @property
-    def each(self) -> list[tuple[float, bool]]:
-        """The same of all answers, without false ones of which nothing is said."""
+    def all_answers(self) -> list[tuple[float, bool]]:
+        """The same of all answers, without false ones of negligible probability."""
         return [(self.right, True), *((p, False) for p in self.wrong if p >= LEAST)]
 
 
-def forecast(answers: Sequence[tuple[int, float, bool]]) -> Forecast:
-    """From (known area, probability, whether it is right) of some answers."""
+def make_forecast(answers: Sequence[tuple[int, float, bool]]) -> Forecast:
+    """The forecast of some answers, each (known area, probability, whether it is right)."""
     right = sum(p for _, p, true in answers if true)
     wrong: dict[int, float] = {}
     for area, p, true in answers:
@@ -199,101 +190,100 @@ def forecast(answers: Sequence[tuple[int, float, bool]]) -> Forecast:
     return Forecast(min(1.0, right), (*wrong.values(), rest))
 
 
-def of_hypotheses(event: Record) -> Forecast:
-    """What the live hypotheses say."""
-    return forecast([(a["area"], a["probability"], a["right"]) for a in event["answers"]])
+def forecast_of_hypotheses(event: Record) -> Forecast:
+    """The forecast of the live hypotheses."""
+    return make_forecast([(a["area"], a["probability"], a["right"]) for a in event["answers"]])
 
 
-def of_arcs(event: Record) -> Forecast:
-    """What the arcs alone say."""
-    return forecast([(a["area"], a["probability"], a["right"]) for a in event["arcs_alone"]])
+def forecast_of_arcs(event: Record) -> Forecast:
+    """The forecast of the arcs alone."""
+    return make_forecast([(a["area"], a["probability"], a["right"]) for a in event["arcs_alone"]])
 
 
-def of_base_rate(event: Record, new: float) -> Forecast:
-    """What one says who knows how often new ground is true.
+def forecast_of_base_rate(event: Record, new: float) -> Forecast:
+    """The forecast of the base rate of new ground.
 
-    :param new: that frequency.
+    :param new: frequency of new ground as a true answer.
     """
     found: list[tuple[int, float, bool]] = []
-    # The answers of one hypothesis follow each other: new ground, then the known areas.
+    # The answers of one hypothesis are consecutive: new ground, then the known areas.
     arcs = event["arcs_alone"]
-    starts = [k for k, answer in enumerate(arcs) if answer["area"] in {NEW, NOT_ASKED}]
+    starts = [k for k, answer in enumerate(arcs) if answer["area"] in {NEW, NOT_EXAMINED}]
     for begin, end in zip(starts, [*starts[1:], len(arcs)], strict=True):
         own = arcs[begin:end]
         weight, known = sum(answer["probability"] for answer in own), len(own) - 1
         for answer in own:
             share = new if answer["area"] == NEW else (1.0 - new) / max(1, known)
             found.append((answer["area"], weight * (share if known else 1.0), answer["right"]))
-    return forecast(found)
+    return make_forecast(found)
 
 
 def new_rate(events: Sequence[Record]) -> float:
-    """Share of the questions of which new ground is a true answer."""
-    true = [any(a["right"] for a in event["arcs_alone"] if a["area"] == NEW) for event in events]
-    return float(np.mean(true)) if true else math.nan
+    """Share of the questions for which new ground is a true answer; NaN if there are none."""
+    return mean([any(a["right"] for a in event["arcs_alone"] if a["area"] == NEW) for event in events])
 
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """Frequency against probability.
+    """Frequency by probability.
 
     :ivar counts: shape (BINS,), answers in each bin.
-    :ivar said: shape (BINS,), mean probability there, NaN in an empty one.
-    :ivar came: shape (BINS,), share of them that is true.
+    :ivar predicted: shape (BINS,), mean probability in each bin, NaN in an empty one.
+    :ivar observed: shape (BINS,), share of true answers in each bin.
     """
 
     counts: NDArray[np.int64]
-    said: NDArray[np.float64]
-    came: NDArray[np.float64]
+    predicted: NDArray[np.float64]
+    observed: NDArray[np.float64]
 
     @property
     def error(self) -> float:
         """Expected calibration error."""
         filled = self.counts > 0
-        gaps = np.abs(self.said[filled] - self.came[filled])
+        gaps = np.abs(self.predicted[filled] - self.observed[filled])
         return float(np.average(gaps, weights=self.counts[filled])) if filled.any() else math.nan
 
 
 def reliability(pairs: Sequence[tuple[float, bool]]) -> Reliability:
-    """Of (probability, whether it came true)."""
-    said, came = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
-    bins = np.minimum((said * BINS).astype(np.int64), BINS - 1)
+    """The reliability of some answers, each (probability, whether it is true)."""
+    predicted, observed = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
+    bins = np.minimum((predicted * BINS).astype(np.int64), BINS - 1)
     counts = np.bincount(bins, minlength=BINS)
     with np.errstate(invalid="ignore"):
         return Reliability(
             counts,
-            np.bincount(bins, weights=said, minlength=BINS) / counts,
-            np.bincount(bins, weights=came, minlength=BINS) / counts,
+            np.bincount(bins, weights=predicted, minlength=BINS) / counts,
+            np.bincount(bins, weights=observed, minlength=BINS) / counts,
         )
 
 
-def of_top(forecasts: Sequence[Forecast]) -> Reliability:
-    """Of the most probable answers."""
-    return reliability([each.top for each in forecasts])
+def reliability_of_top(forecasts: Sequence[Forecast]) -> Reliability:
+    """The reliability of the most probable answers."""
+    return reliability([forecast.top for forecast in forecasts])
 
 
-def of_each(forecasts: Sequence[Forecast]) -> Reliability:
-    """Of all answers."""
-    return reliability([pair for each in forecasts for pair in each.each])
+def reliability_of_all(forecasts: Sequence[Forecast]) -> Reliability:
+    """The reliability of all answers."""
+    return reliability([pair for forecast in forecasts for pair in forecast.all_answers])
 
 
 def interval(
     by_run: Sequence[Sequence[Forecast]], figure: Callable[[Sequence[Forecast]], float]
 ) -> tuple[float, float]:
-    """Between which values a figure is in 95 % of the draws of as many runs, with replacement."""
+    """The 95 % bootstrap interval of a figure over the runs."""
     draw = np.random.default_rng(0)
     runs = [own for own in by_run if own]
     values = []
     for _ in range(_DRAWS if runs else 0):
         chosen = draw.integers(len(runs), size=len(runs))
-        values.append(figure([each for k in chosen for each in runs[k]]))
+        values.append(figure([forecast for k in chosen for forecast in runs[k]]))
     low, high = np.percentile(values, [2.5, 97.5]) if values else (math.nan, math.nan)
     return float(low), float(high)
 
 
 def measure_consistency(settings: Settings) -> Report:
     """Map the worlds and compare covariances with errors."""
-    records = records_of(settings)
+    records = make_records(settings)
     report = Report("consistency", "Consistency of the covariances", seeds=chosen_seeds(settings))
     low, high = ALLOWED
     report.requirements.append(Requirement("runs", len(records), math.inf, least=CONSISTENCY_RUNS))
@@ -306,26 +296,24 @@ def measure_consistency(settings: Settings) -> Report:
         kind: {record["world"]: samples(record) for record in records} for kind, samples in KINDS.items()
     }
     report.pictures["nees.png"] = "Share of errors below a NEES; the line is chi-square with 3 degrees of freedom."
-    pooled = {kind: [each for record in records for each in KINDS[kind](record)] for kind in _REQUIRED}
+    pooled = {kind: [forecast for record in records for forecast in KINDS[kind](record)] for kind in _REQUIRED}
     plot_nees(settings.out / "nees.png", pooled)
     return report
 
 
 def run_means(records: Sequence[Record], samples: _Samples) -> list[float]:
     """The mean NEES of every run that has any."""
-    return [float(np.mean(own)) for record in records if (own := samples(record))]
+    return [mean(own) for record in records if (own := samples(record))]
 
 
 def mean_nees(records: Sequence[Record], samples: _Samples) -> float:
-    """Mean over runs of the mean within each."""
-    means = run_means(records, samples)
-    return float(np.mean(means)) if means else math.nan
+    """Mean over runs of the mean within each; NaN if there are none."""
+    return mean(run_means(records, samples))
 
 
-def covered(records: Sequence[Record], samples: _Samples) -> float:
-    """Share of all errors within the 95 % ellipsoid."""
-    pooled = [each <= COVERED for record in records for each in samples(record)]
-    return float(np.mean(pooled)) if pooled else math.nan
+def coverage(records: Sequence[Record], samples: _Samples) -> float:
+    """Share of all errors within the 95 % ellipsoid; NaN if there are none."""
+    return mean([sample <= COVERED for record in records for sample in samples(record)])
 
 
 def _nees_table(records: list[Record]) -> str:
@@ -335,46 +323,46 @@ def _nees_table(records: list[Record]) -> str:
         if means := run_means(records, samples):
             count = sum(len(samples(record)) for record in records)
             figures = [f"{value:.2f}" for value in (np.mean(means), np.median(means), max(means))]
-            rows.append([kind, str(len(means)), str(count), *figures, f"{100.0 * covered(records, samples):.1f} %"])
+            rows.append([kind, str(len(means)), str(count), *figures, f"{100.0 * coverage(records, samples):.1f} %"])
     return table(head, rows)
 
 
 def _nees_by_family(records: list[Record]) -> str:
     head = ["family", *(word for kind in _REQUIRED for word in (f"NEES of {kind}", "within 95 %"))]
     rows = []
-    for family, own in by_family(records).items():
-        pairs = [(mean_nees(own, KINDS[kind]), covered(own, KINDS[kind])) for kind in _REQUIRED]
+    for family, own in group_by_family(records).items():
+        pairs = [(mean_nees(own, KINDS[kind]), coverage(own, KINDS[kind])) for kind in _REQUIRED]
         rows.append([family, *(cell for mean, share in pairs for cell in (f"{mean:.2f}", f"{100.0 * share:.1f} %"))])
     return table(head, rows)
 
 
 def plot_reliability(path: Path, curves: Mapping[str, Reliability]) -> None:
-    """Frequency against probability with Wilson's 95 % intervals, and how many answers are in each bin.
+    """Draw frequency against probability with Wilson's 95 % intervals, and the number of answers in each bin.
 
-    :param curves: {of what: its reliability}.
+    :param curves: {name: reliability}.
     """
     figure = Figure(figsize=(5.0 * len(curves), 6.0), layout="constrained")
     grid = figure.subplots(2, len(curves), squeeze=False, height_ratios=(3.0, 1.0))
     for column, (name, curve) in enumerate(curves.items()):
         upper, lower = grid[0][column], grid[1][column]
         filled = curve.counts > 0
-        said, came, counts = curve.said[filled], curve.came[filled], curve.counts[filled]
-        low, high = _wilson(came, counts)
+        predicted, observed, counts = curve.predicted[filled], curve.observed[filled], curve.counts[filled]
+        low, high = _wilson_interval(observed, counts)
         upper.plot([0.0, 1.0], [0.0, 1.0], color="black", linewidth=0.8)
-        bars = np.maximum(0.0, np.stack((came - low, high - came)))
-        upper.errorbar(said, came, bars, fmt="o-", capsize=3)
-        upper.set_title(f"{name}: expected error {curve.error:.3f}")
-        upper.set_ylabel("share that is true")
-        lower.bar(said, counts, width=0.04)
+        bars = np.maximum(0.0, np.stack((observed - low, high - observed)))
+        upper.errorbar(predicted, observed, bars, fmt="o-", capsize=3)
+        upper.set(title=f"{name}: expected error {curve.error:.3f}", ylabel="share that is true")
+        lower.bar(predicted, counts, width=0.04)
         lower.set_yscale("log")
         lower.set_xlim(upper.get_xlim())
-        lower.set_xlabel("probability")
-        lower.set_ylabel("answers")
+        lower.set(xlabel="probability", ylabel="answers")
     figure.savefig(path, dpi=_DPI)
 
 
-def _wilson(shares: NDArray[np.float64], counts: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The 95 % intervals of some shares of so many."""
+def _wilson_interval(
+    shares: NDArray[np.float64], counts: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Wilson's 95 % intervals of some shares, by their counts."""
     z2 = 1.96**2
     middle = (shares + z2 / (2.0 * counts)) / (1.0 + z2 / counts)
     half = np.sqrt(z2 * (shares * (1.0 - shares) / counts + z2 / (4.0 * counts**2))) / (1.0 + z2 / counts)
@@ -382,19 +370,18 @@ def _wilson(shares: NDArray[np.float64], counts: NDArray[np.int64]) -> tuple[NDA
 
 
 def plot_nees(path: Path, samples: Mapping[str, Sequence[float]]) -> None:
-    """Cumulative distributions of normalised errors.
+    """Draw the cumulative distributions of normalized errors.
 
-    :param samples: {of what: NEES}.
+    :param samples: {name: NEES}.
     """
     figure = Figure(figsize=(6.0, 4.5), layout="constrained")
     axes = figure.subplots()
     errors = np.geomspace(0.01, 100.0, 200)
     for name, own in samples.items():
         axes.plot(np.sort(own), (np.arange(len(own)) + 1.0) / max(1, len(own)), label=name)
-    axes.plot(errors, gammainc(1.5, 0.5 * errors), color="black", linewidth=0.8, label="as it should be")
-    axes.set_xscale("log")
-    axes.set_xlim(0.01, 100.0)
-    axes.set_xlabel("NEES")
-    axes.set_ylabel("share of errors below")
+    axes.plot(
+        errors, gammainc(1.5, 0.5 * errors), color="black", linewidth=0.8, label="chi-square, 3 degrees of freedom"
+    )
+    axes.set(xscale="log", xlim=(0.01, 100.0), xlabel="NEES", ylabel="share of errors below")
     axes.legend(fontsize=7)
     figure.savefig(path, dpi=_DPI)

@@ -1,6 +1,6 @@
-"""Map a log and tell what that costs as it goes on: ``python -m benchmark.charted_run WAY LOG --out DIR ...``.
+"""Map a log and record the cost over time: ``python -m benchmark.charted_run VARIANT LOG --out DIR ...``.
 
-WAY is ``areas``, as ``hmt_slam map`` does it, or ``metric``: the same program with one area for everything, which is a
+VARIANT is ``areas``, as ``hmt_slam map`` does it, or ``metric``: the same program with a single area, which is a
 Rao-Blackwellized particle filter over one global map. The other arguments are those of ``hmt_slam map``. DIR gets the
 trajectory and a report.
 """
@@ -31,27 +31,27 @@ from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.final_map import FinalMap, deskewed_scans, final_map
 
 SAMPLES = 200
-"""Points of the curve of memory over time, at least, where the log has as many scans."""
+"""Smallest number of points of the curve of memory over time, for logs with as many scans."""
 
 AREAS, METRIC = "areas", "metric"
 
 
 class OneArea:
-    """In the place of area abstraction: no keyframe ever leaves the first area."""
+    """Replacement for the area abstraction, in which no keyframe ever leaves the first area."""
 
     def __init__(self, _configuration: Configuration) -> None:
         pass
 
     def handle(self, message: Message) -> list[Message]:
-        """Answer a ``Keyframe``: nothing was left."""
+        """The empty answer to a ``Keyframe``."""
         return [AreaEvents(message.sequence, ())] if isinstance(message, Keyframe) else []
 
 
-WAYS: dict[str, Callable[[Configuration], Process]] = {AREAS: Aam, METRIC: OneArea}
+VARIANTS: dict[str, Callable[[Configuration], Process]] = {AREAS: Aam, METRIC: OneArea}
 
 
 class TimedLog:
-    """A log, and the CPU time that reading or simulating it takes.
+    """A log with the CPU time that reading or simulating it takes.
 
     :ivar seconds: spent so far.
     """
@@ -76,7 +76,7 @@ class TimedLog:
         return self._log.duration
 
     def records(self) -> Iterator[LogRecord]:
-        """As those of the log."""
+        """The records of the log."""
         records = self._log.records()
         while True:
             begin = time.process_time()
@@ -87,13 +87,15 @@ class TimedLog:
             yield record
 
 
-def resident_bytes() -> int:
-    """Memory of this OS process that is in use now."""
-    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+def resident_bytes(process: int | str = "self") -> int:
+    """Current resident memory of an OS process, by default this one."""
+    return int(Path(f"/proc/{process}/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def charted(way: str, log: TimedLog, configuration: Configuration) -> tuple[RunResult, FinalMap, dict[str, Any]]:
-    """Map a log; what came of it, and what it cost."""
+def map_and_monitor(
+    variant: str, log: TimedLog, configuration: Configuration
+) -> tuple[RunResult, FinalMap, dict[str, Any]]:
+    """Map a log; return the results and their cost."""
     gc.freeze()
     every = max(1, log.scan_count // SAMPLES)
     memory = [(0, resident_bytes())]
@@ -102,7 +104,7 @@ def charted(way: str, log: TimedLog, configuration: Configuration) -> tuple[RunR
         if scans % every == 0:
             memory.append((scans, resident_bytes()))
 
-    result = run_log(log, configuration, sample, WAYS[way])
+    result = run_log(log, configuration, sample, VARIANTS[variant])
     memory.append((len(result.log_progress.stamps), resident_bytes()))
     begin, log_seconds = time.process_time(), log.seconds
     final = final_map(
@@ -113,7 +115,7 @@ def charted(way: str, log: TimedLog, configuration: Configuration) -> tuple[RunR
     facts = {
         "particles": configuration.filter.particles,
         "scans": len(result.log_progress.stamps),
-        "travelled_m": final.recording.probabilities[-1].path_length,
+        "traveled_m": final.recording.probabilities[-1].path_length,
         "areas": len(hybrid_map.area_ids()),
         "loop_closures": sum(arc.closure for _, _, arc in hybrid_map.all_arcs()),
         "log_s": log.seconds,
@@ -127,7 +129,7 @@ def charted(way: str, log: TimedLog, configuration: Configuration) -> tuple[RunR
 
 
 def _seconds(result: RunResult, scans: int) -> float:
-    """Time of the log after so many scans, s."""
+    """Time of the log after a number of scans, s."""
     return float(result.log_progress.stamps[max(0, scans - 1)] - result.log_progress.stamps[0]) / 1e9
 
 
@@ -140,11 +142,11 @@ def _cost(result: RunResult, every: int) -> list[dict[str, float]]:
 
 def main(arguments: list[str]) -> int:
     """Run; return the exit status."""
-    way, *rest = arguments
+    variant, *rest = arguments
     options = build_parser().parse_args(["map", *rest])
     try:
         configuration = chosen_configuration(options)
-        result, final, facts = charted(way, TimedLog(open_log(options.log)), configuration)
+        result, final, facts = map_and_monitor(variant, TimedLog(open_log(options.log)), configuration)
     except HmtSlamError as fault:
         print(f"charted_run: {fault}", file=sys.stderr)
         return 2

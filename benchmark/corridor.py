@@ -1,8 +1,7 @@
 """The filter in a bare corridor: ``python -m benchmark.corridor [--seeds N]``.
 
-Between two straight walls without ends the scans show nothing of how far the robot came. So the motion along the walls
-has to be that of the odometry, whose noise is here drawn as the motion model has it, and its covariance must cover the
-truth; it is what arcs are made of.
+Between two straight walls without ends, scans have no information along the walls. The motion along them is that of the
+odometry, whose noise is drawn from the motion model. The covariance, from which arcs are made, has to cover the truth.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from hmt_slam_ros.submap.particle_filter import ParticleFilter
 
 SEEDS = 24
 LEGS = {"a keyframe on": 1, "an arc, 20 keyframes on": 20}
-"""{what is compared: from a keyframe to the one so many later}."""
+"""{name of a motion: number of keyframes from its start to its end}."""
 
 _LENGTH, _STEP, _PERIOD = 30.0, 0.25, 250_000_000  # m of the drive, m and ns between scans
 _WEAVE = 0.05  # rad to each side by which the robot weaves
@@ -35,14 +34,14 @@ _BEARINGS = np.radians(np.arange(-90.0, 91.0))
 _COVERED = 3.841  # chi-square of 95 % in one dimension
 
 
-class Drive(NamedTuple):
-    """What the filter made of one drive.
+class CorridorDrive(NamedTuple):
+    """The estimates of the filter on one drive.
 
     :ivar truths: of the keyframes, x along the corridor, shape (k, 3).
     :ivar poses: as estimated, map frame, shape (k, 3).
-    :ivar covariances: what the step that led to each adds to the drift, in its own frame, shape (k, 3, 3).
+    :ivar covariances: of the step to each keyframe, in its own frame, shape (k, 3, 3).
     :ivar odometry_errors: of the odometry along the corridor from the start to each, shape (k,), m.
-    :ivar floor: deviations that every arc has at least, m and degrees.
+    :ivar floor: smallest deviations of an arc, m and degrees.
     """
 
     truths: NDArray[np.float64]
@@ -53,7 +52,7 @@ class Drive(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """Of some motions, along the corridor and across it.
+    """Errors of some motions, along the corridor and across it.
 
     :ivar errors: shape (n, 2), m.
     :ivar variances: stated, shape (n, 2), m^2.
@@ -68,24 +67,24 @@ class Errors(NamedTuple):
 
     @property
     def nees(self) -> NDArray[np.float64]:
-        """Normalised estimation error squared, 1 where the covariance is right, shape (2,)."""
+        """Normalized estimation error squared, 1 for a correct covariance, shape (2,)."""
         nees: NDArray[np.float64] = (self.errors**2 / self.variances).mean(axis=0)
         return nees
 
     @property
-    def covered(self) -> NDArray[np.float64]:
+    def coverage(self) -> NDArray[np.float64]:
         """Share of the motions whose interval of 95 % covers the truth, shape (2,)."""
-        covered: NDArray[np.float64] = (self.errors**2 / self.variances < _COVERED).mean(axis=0)
-        return covered
+        coverage: NDArray[np.float64] = (self.errors**2 / self.variances < _COVERED).mean(axis=0)
+        return coverage
 
     @property
-    def shrink(self) -> tuple[float, float]:
-        """By how much the corridor comes out shorter than by odometry, as a share, and the deviation of that mean."""
+    def shortening(self) -> tuple[float, float]:
+        """Share by which the corridor is shorter than by odometry, and the deviation of that mean."""
         shorter = (self.odometry_errors - self.errors[:, 0]) / self.lengths.mean()
         return float(shorter.mean()), float(shorter.std() / np.sqrt(shorter.size))
 
 
-def drive(seed: int, length: float = _LENGTH) -> Drive:
+def drive(seed: int, length: float = _LENGTH) -> CorridorDrive:
     """Drive along the corridor, weaving a little.
 
     :param length: m.
@@ -94,7 +93,7 @@ def drive(seed: int, length: float = _LENGTH) -> Drive:
     mapping, motion = LocalMapping(configuration), MotionModel(configuration.motion)
     live = LiveHypothesis(ParticleFilter(mapping, 0, 0), configuration.filter)
     random = np.random.default_rng(seed)
-    truths = _path(length, random)
+    truths = _make_path(length, random)
     odometry, error, odometry_errors = np.zeros(3), 0.0, np.zeros(len(truths))
     for k, truth in enumerate(truths):
         if k:
@@ -105,90 +104,92 @@ def drive(seed: int, length: float = _LENGTH) -> Drive:
             error += float(np.cos(truth[2]) * slip[0] - np.sin(truth[2]) * slip[1])
             odometry_errors[k] = error
         motion.odometry.add(Odometry(k * _PERIOD, odometry))
-        scan = _scan(k * _PERIOD, truth, random)
-        _take(live, motion, k, PreparedScan(mapping, scan))
+        scan = _make_scan(k * _PERIOD, truth, random)
+        _process_scan(live, motion, k, PreparedScan(mapping, scan))
     kept = live.filter.keyframes
     covariances = np.array([live.step_covariances[keyframe] for keyframe in kept])
     floor = configuration.tlca.arc_sigma_floor, configuration.tlca.arc_angle_floor
-    return Drive(truths[kept], live.filter.leading_keyframe_poses(), covariances, odometry_errors[kept], floor)
+    return CorridorDrive(truths[kept], live.filter.leading_keyframe_poses(), covariances, odometry_errors[kept], floor)
 
 
-def _path(length: float, random: np.random.Generator) -> NDArray[np.float64]:
+def _make_path(length: float, random: np.random.Generator) -> NDArray[np.float64]:
     """Poses (n, 3) of the scans, near the middle of the corridor."""
     x = np.arange(0.0, length + 1e-9, _STEP)
     headings = _WEAVE * np.sin(x / 3.0 + random.uniform(0.0, 2.0 * np.pi))
-    aside = np.concatenate(([random.uniform(-0.4, 0.4)], _STEP * np.sin(headings[:-1])))
-    return np.stack((x, np.cumsum(aside), headings), axis=1)
+    lateral = np.concatenate(([random.uniform(-0.4, 0.4)], _STEP * np.sin(headings[:-1])))
+    return np.stack((x, np.cumsum(lateral), headings), axis=1)
 
 
-def _scan(stamp: int, pose: NDArray[np.float64], random: np.random.Generator) -> Scan:
+def _make_scan(stamp: int, pose: NDArray[np.float64], random: np.random.Generator) -> Scan:
     sines = np.sin(_BEARINGS + pose[2])
     with np.errstate(divide="ignore"):
         ranges = (np.sign(sines) * _HALF_WIDTH - pose[1]) / sines
-    seen = ranges + _NOISE * random.standard_normal(ranges.size)
-    seen = np.where(ranges < _REACH, seen, np.inf).astype(np.float32)
-    return Scan(stamp, seen, _BEARINGS[0], _BEARINGS[1] - _BEARINGS[0], 0.05, _REACH + 1.0)
+    noisy_ranges = ranges + _NOISE * random.standard_normal(ranges.size)
+    noisy_ranges = np.where(ranges < _REACH, noisy_ranges, np.inf).astype(np.float32)
+    return Scan(stamp, noisy_ranges, _BEARINGS[0], _BEARINGS[1] - _BEARINGS[0], 0.05, _REACH + 1.0)
 
 
-def _take(live: LiveHypothesis, motion: MotionModel, number: int, sighting: PreparedScan) -> None:
-    """What metric SLAM does with a scan where no other process has anything to say."""
-    prediction = motion.predict(sighting.scan.stamp)
+def _process_scan(live: LiveHypothesis, motion: MotionModel, number: int, prepared_scan: PreparedScan) -> None:
+    """Process a scan as metric SLAM does without the other processes."""
+    prediction = motion.predict(prepared_scan.scan.stamp)
     if number:
-        tracked = live.filter.track(sighting, prediction)
-        motion.observe(tracked.increment, tracked.information, tracked.contradicts_odometry)
-    if not number or live.is_event_due(sighting):
-        live.process_keyframe(number, sighting, after_reset=number == 0)
+        match = live.filter.track(prepared_scan, prediction)
+        motion.observe(match.increment, match.information, match.contradicts_odometry)
+    if not number or live.is_event_due(prepared_scan):
+        live.process_keyframe(number, prepared_scan, after_reset=number == 0)
         motion.observe_keyframe(live.event.motion, live.event.match_information)
 
 
-def errors_of(drives: Sequence[Drive], stride: int) -> Errors:
-    """Of the motions from one keyframe to the one ``stride`` later, which do not overlap."""
+def errors_of(drives: Sequence[CorridorDrive], stride: int) -> Errors:
+    """Errors of the disjoint motions from one keyframe to the one ``stride`` later."""
     rows = []
-    for one in drives:
-        rows += [_error(one, first, first + stride) for first in range(0, len(one.poses) - stride, stride)]
+    for drive in drives:
+        rows += [_motion_error(drive, first, first + stride) for first in range(0, len(drive.poses) - stride, stride)]
     errors, variances, odometry_errors, lengths = zip(*rows, strict=True)
     return Errors(np.array(errors), np.array(variances), np.array(odometry_errors), np.array(lengths))
 
 
-def _error(one: Drive, first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
-    """Error (2,) and variance (2,) of a motion along and across the corridor, odometry's error and true length."""
-    sigma, angle = one.floor
+def _motion_error(
+    drive: CorridorDrive, first: int, last: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
+    """Error (2,) and variance (2,) of a motion along and across the corridor, error of odometry and true length."""
+    sigma, angle = drive.floor
     covariance = np.zeros((3, 3))
     for k in range(first + 1, last + 1):
-        ad = se2.adjoint(se2.between(one.poses[k], one.poses[k - 1]))
-        covariance = ad @ covariance @ ad.T + one.covariances[k]
-    true, found = (se2.between(poses[first], poses[last]) for poses in (one.truths, one.poses))
+        ad = se2.adjoint(se2.between(drive.poses[k], drive.poses[k - 1]))
+        covariance = ad @ covariance @ ad.T + drive.covariances[k]
+    true, found = (se2.between(poses[first], poses[last]) for poses in (drive.truths, drive.poses))
     covariance = covariance + np.diag([sigma, sigma, np.radians(angle)]) ** 2
-    turn = se2.adjoint(np.array([0.0, 0.0, one.truths[last, 2]]))
+    turn = se2.adjoint(np.array([0.0, 0.0, drive.truths[last, 2]]))
     error = turn @ se2.log(se2.between(true, found))
-    odometry_error = float(one.odometry_errors[last] - one.odometry_errors[first])
-    length = float(one.truths[last, 0] - one.truths[first, 0])
+    odometry_error = float(drive.odometry_errors[last] - drive.odometry_errors[first])
+    length = float(drive.truths[last, 0] - drive.truths[first, 0])
     return error[:2], np.diag(turn @ covariance @ turn.T)[:2], odometry_error, length
 
 
-def report(drives: Sequence[Drive]) -> str:
-    """The table."""
+def report(drives: Sequence[CorridorDrive]) -> str:
+    """The table of errors."""
     head = ["motion", "number", "shrink [%]", "odometry [m]", "error [m]", "stated [m]", "NEES along", "across"]
     head += ["covered along [%]", "across"]
     rows = []
     for name, stride in LEGS.items():
         found = errors_of(drives, stride)
-        shrink, deviation = found.shrink
+        shortening, deviation = found.shortening
         wheels, along = (np.sqrt(np.mean(values**2)) for values in (found.odometry_errors, found.errors[:, 0]))
         figures = [f"{wheels:.3f}", f"{along:.3f}", f"{np.sqrt(found.variances[:, 0].mean()):.3f}"]
-        shares = [f"{100.0 * share:.1f}" for share in found.covered]
-        shrunk = f"{100.0 * shrink:+.2f} ± {100.0 * deviation:.2f}"
+        shares = [f"{100.0 * share:.1f}" for share in found.coverage]
+        shrunk = f"{100.0 * shortening:+.2f} ± {100.0 * deviation:.2f}"
         rows.append([name, str(len(found.errors)), shrunk, *figures, *(f"{n:.2f}" for n in found.nees), *shares])
     return table(head, rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Drive once for every seed and print the table."""
+    """Drive once for every seed, and print the table."""
     parser = OneSentenceParser(prog="python -m benchmark.corridor", description="A bare corridor in the filter.")
     parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help="seeds 0 to N-1")
     seeds = parser.parse_args(arguments).seeds
     if seeds < 1:
-        parser.error(f"--seeds {seeds} leaves nothing to measure: give 1 or more")
+        parser.error(f"--seeds {seeds} is too small: give 1 or more")
     print(report([drive(seed) for seed in range(seeds)]))
     return 0
 

@@ -4,17 +4,17 @@
 run is also the seed of what is drawn for the odometry.
 
 ==========  ==========================================================================================================
-kind        what is done to the odometry
+kind        degradation of the odometry
 ==========  ==========================================================================================================
 noise-2x    Gaussian noise on every increment, so that the error of the motion model's defaults grows twofold
 noise-4x    the same, fourfold
 slip        at random turns of more than 45 degrees, one in five, the heading slips by 20 degrees within a second
-missing     5 % of the readings, drawn at random, never came
-none        no reading ever came
+missing     5 % of the readings, drawn at random, are missing
+none        all readings are missing
 ==========  ==========================================================================================================
 
-The noise is a random walk: its variance grows with the distance and the angle travelled, whatever the rate of the
-readings, and over one metre or one radian the deviation is the motion model's. The same log, kind and seed give the
+The noise is a random walk: its variance grows with the distance and the angle traveled, for any rate of the
+readings, and over one meter or one radian the deviation is the motion model's. The same log, kind and seed give the
 same readings, bit for bit.
 """
 
@@ -77,7 +77,7 @@ class DegradedLog:
         return self.original.duration
 
     def records(self) -> Iterator[LogRecord]:
-        """All measurements in file order, with the odometry readings that are left."""
+        """All measurements in file order, with the remaining odometry readings."""
         index = 0
         for record in self.original.records():
             measurement = record.measurement
@@ -89,7 +89,7 @@ class DegradedLog:
             index += 1
 
 
-def degraded(log: Log, kind: str, seed: int) -> DegradedLog:
+def degrade_log(log: Log, kind: str, seed: int) -> DegradedLog:
     """The log with its odometry degraded.
 
     :param kind: one of ``KINDS``.
@@ -108,13 +108,13 @@ def degraded(log: Log, kind: str, seed: int) -> DegradedLog:
     poses = np.array([reading.pose for reading in readings])
     increments = se2.between(poses[:-1], poses[1:])
     if kind == "slip":
-        errors = _slips(np.array([reading.stamp for reading in readings]) / NANOSECONDS, increments, random)
+        errors = _slip_errors(np.array([reading.stamp for reading in readings]) / NANOSECONDS, increments, random)
     else:
-        errors = _noise(increments, {"noise-2x": 2.0, "noise-4x": 4.0}[kind], random)
-    return DegradedLog(log, kind, dict(enumerate(_chained(poses[0], se2.compose(increments, errors)))))
+        errors = _noise_errors(increments, {"noise-2x": 2.0, "noise-4x": 4.0}[kind], random)
+    return DegradedLog(log, kind, dict(enumerate(_chain(poses[0], se2.compose(increments, errors)))))
 
 
-def _chained(first: NDArray[np.float64], increments: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def _chain(first: NDArray[np.float64], increments: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Poses (3,) that begin at ``first`` and follow the increments (n, 3)."""
     poses = [first]
     for increment in increments:
@@ -122,7 +122,7 @@ def _chained(first: NDArray[np.float64], increments: NDArray[np.float64]) -> lis
     return poses
 
 
-def _noise(increments: NDArray[np.float64], factor: float, random: np.random.Generator) -> NDArray[np.float64]:
+def _noise_errors(increments: NDArray[np.float64], factor: float, random: np.random.Generator) -> NDArray[np.float64]:
     """Errors (n, 3), in the frame of each increment's end, that add up with the odometry's own to ``factor`` times."""
     motion = MotionParameters()
     distance, angle = np.hypot(increments[:, 0], increments[:, 1]), np.abs(increments[:, 2])
@@ -138,7 +138,7 @@ def _noise(increments: NDArray[np.float64], factor: float, random: np.random.Gen
     return deviations * random.standard_normal(increments.shape)
 
 
-def _slips(
+def _slip_errors(
     seconds: NDArray[np.float64], increments: NDArray[np.float64], random: np.random.Generator
 ) -> NDArray[np.float64]:
     """Errors (n, 3) of heading, each slip spread evenly over a second from the middle of its turn."""
@@ -179,7 +179,7 @@ def main(arguments: list[str]) -> int:
         configuration = chosen_configuration(options)
         part = configuration.robot
         recorded = open_log(options.log, start=part.start, duration=part.duration or None)
-        log = degraded(recorded, kind, configuration.seed)
+        log = degrade_log(recorded, kind, configuration.seed)
         with atomic_output(options.out) as folder:
             final, source_stamps, figures = run_measured(log, configuration)
             write_output(folder, final, source_stamps, figures, configuration)

@@ -22,15 +22,15 @@ from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.driven_robot import DrivenLog, DrivenRobot
 
 
-class _Ears:
-    """The robot as a process: it does what it is told, and notes how errands end."""
+class _RobotProcess:
+    """The robot as a process: it applies velocity commands, and keeps the last task result."""
 
     def __init__(self, robot: DrivenRobot) -> None:
         self._robot = robot
         self.outcome: TaskResult | None = None
 
     def handle(self, message: Message) -> list[Message]:
-        """Take in one message."""
+        """Handle one message."""
         if isinstance(message, VelocityCommand):
             self._robot.set_velocity(message.speed, message.turn_rate)
         elif isinstance(message, TaskResult):
@@ -42,7 +42,7 @@ Driver = TypeVar("Driver", Explorer, PilotProcess)
 
 
 class DrivenRun(Generic[Driver]):
-    """Robot, SLAM and who drives it.
+    """A lock-step run of robot, SLAM and its driver.
 
     :ivar robot: in its world.
     :ivar driver: the explorer, or the pilot.
@@ -51,35 +51,35 @@ class DrivenRun(Generic[Driver]):
     def __init__(
         self, robot: DrivenRobot, configuration: Configuration, driver: Driver, state: RunState | None = None
     ) -> None:
-        """:param state: that the run goes on from, with the robot anywhere in its map; None for none."""
+        """:param state: saved map to start from, without an initial pose; None for none."""
         self.robot = robot
         self.driver: Driver = driver
-        self._ears = _Ears(robot)
+        self._robot_process = _RobotProcess(robot)
         name = "explorer" if isinstance(driver, Explorer) else "pilot"
-        self._run = LockStepRun(configuration, state=state, observers={name: driver, "robot": self._ears})
+        self._run = LockStepRun(configuration, state=state, observers={name: driver, "robot": self._robot_process})
         log = DrivenLog("driven", robot)
         self._records = log.records() if state is None else self._run.unread_records(log)
 
-    def do(self, errand: Task, seconds: float) -> TaskResult | None:
-        """What comes of an errand, None where it takes longer.
+    def run_task(self, task: Task, seconds: float) -> TaskResult | None:
+        """Run a task; return its result, None if it takes too long.
 
-        :param seconds: that it may take.
+        :param seconds: largest duration of the task.
         """
-        self._ears.outcome = None
-        self._run.lock_step.feed(errand)
+        self._robot_process.outcome = None
+        self._run.lock_step.feed(task)
         end = self.robot.stamp + round(seconds * NANOSECONDS)
         for record in self._records:
             self._run.process_record(record)
             if isinstance(record.measurement, Scan):
                 self._run.recorder.compact()
-                if self._ears.outcome is not None or self.robot.stamp >= end:
+                if self._robot_process.outcome is not None or self.robot.stamp >= end:
                     break
-        return self._ears.outcome
+        return self._robot_process.outcome
 
     def save(self, folder: Path, configuration: Configuration) -> Recording:
-        """End the drive, and write its map for nodes to begin with.
+        """End the drive, and write its map for nodes to start from.
 
-        :param folder: to be made.
+        :param folder: which is created.
         """
         folder.mkdir(parents=True)
         writer = map_writer(folder)
@@ -96,8 +96,8 @@ class DrivenRun(Generic[Driver]):
 
 
 def true_place(run: DrivenRun[Explorer], name: str) -> NDArray[np.float64]:
-    """Where the robot truly was when it took the keyframe in the middle of a named place, ``world_T_base`` (3,)."""
-    atlas = run.driver.exploration_map
-    stamp = atlas.replica.scans[atlas.named_places()[name]].stamp
+    """True pose of the robot at the keyframe of a named place, ``world_T_base`` (3,)."""
+    exploration_map = run.driver.exploration_map
+    stamp = exploration_map.replica.scans[exploration_map.named_places()[name]].stamp
     true: NDArray[np.float64] = run.robot.true_poses(np.array([stamp]))[0]
     return true

@@ -30,22 +30,22 @@ _DOORS, _DOOR, _ROOM, _WALL = 8, 0.9, 3.0, 0.2
 
 
 class Leg(NamedTuple):
-    """The way to one goal.
+    """The drive to one goal.
 
     :ivar reached: whether the robot arrived in time.
-    :ivar contacts: how often it came upon something.
-    :ivar metres: driven.
-    :ivar seconds: of the simulation.
+    :ivar contacts: number of contacts.
+    :ivar distance: driven, m.
+    :ivar seconds: simulated time, s.
     """
 
     reached: bool
     contacts: int
-    metres: float
+    distance: float
     seconds: float
 
 
 def scenario_of(family: str, seed: int, laser: str, people: int = _PEOPLE) -> Scenario:
-    """A floor with what is about in it."""
+    """A floor with furniture and people."""
     if family == "institute":
         settings = f"odometry=0,people={people}" + "".join(f",{name}={value}" for name, value in LASERS[laser].items())
         return open_simulated(f"sim:institute,seed={seed},{settings}").scenario
@@ -62,14 +62,14 @@ def _doors(seed: int) -> Building:
         if k:
             y = draw.uniform(-0.5, 0.5) * (_ROOM - _DOOR - 0.4)
             plan.cut_rectangle(begin - _WALL - 0.01, y - 0.5 * _DOOR, begin + 0.01, y + 0.5 * _DOOR)
-            # The scripted way, of which only the middles of the rooms are goals.
+            # The scripted route, of which only the centers of the rooms are goals.
             route += [(begin - 0.5 * _ROOM, y), (begin + 0.4 * _ROOM, y), (begin + 0.5 * _ROOM, 0.0)]
     pose = np.array([*draw.uniform(-5.0, 5.0, 2), draw.uniform(-3.0, 3.0)])
     return Building(plan.walls(), np.array(route)).transform(pose)
 
 
 def goals_of(scenario: Scenario) -> NDArray[np.float64]:
-    """Where to drive one after the other, (n, 2), m."""
+    """Goals in their order, shape (n, 2), m."""
     route = scenario.building.route
     if len(scenario.building.states.poses):
         return route[1:]
@@ -77,32 +77,30 @@ def goals_of(scenario: Scenario) -> NDArray[np.float64]:
     return np.concatenate((middles[1:], middles[-2::-1]))
 
 
-def driven(scenario: Scenario, most: int | None = None) -> Iterator[Leg]:
-    """Drive from goal to goal.
+def drive_goals(scenario: Scenario, max_goals: int | None = None) -> Iterator[Leg]:
+    """Drive from goal to goal, with a leg for each.
 
-    :param most: of the goals, None for all.
+    :param max_goals: number of goals, None for all.
     """
-    settings = scenario.settings
-    limits = MotionLimits(
-        settings.speed,
-        math.radians(settings.turn_rate),
-        ACCELERATION,
-        TURN_ACCELERATION,
-        settings.radius,
-        period=1.0 / settings.rate,
-    )
+    limits = motion_limits(scenario.settings)
     robot = DrivenRobot(scenario)
-    for goal in goals_of(scenario)[:most]:
-        contacts, metres, begin = robot.contacts, robot.distance_traveled, robot.stamp
+    for goal in goals_of(scenario)[:max_goals]:
+        contacts, distance, begin = robot.contacts, robot.distance_traveled, robot.stamp
         reached = _drive_to(robot, goal, limits)
         seconds = (robot.stamp - begin) / NANOSECONDS
-        yield Leg(reached, robot.contacts - contacts, robot.distance_traveled - metres, seconds)
+        yield Leg(reached, robot.contacts - contacts, robot.distance_traveled - distance, seconds)
         if not reached:
             robot.kidnap(np.array([*goal, robot.pose[2]]))
 
 
+def motion_limits(settings: WorldSettings) -> MotionLimits:
+    """The limits of a simulated robot."""
+    turn_rate, period = math.radians(settings.turn_rate), 1.0 / settings.rate
+    return MotionLimits(settings.speed, turn_rate, ACCELERATION, TURN_ACCELERATION, settings.radius, period=period)
+
+
 def _drive_to(robot: DrivenRobot, goal: NDArray[np.float64], limits: MotionLimits) -> bool:
-    """Whether it arrives in time."""
+    """Drive to a goal; return whether the robot arrives in time."""
     end = robot.stamp + round(_TIME * NANOSECONDS)
     while robot.stamp < end:
         scan = robot.measure()[1]

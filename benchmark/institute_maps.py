@@ -1,4 +1,4 @@
-"""Maps of scripted drives through a simulated institute, and their charts beside the truth."""
+"""Maps of scripted drives through a simulated institute, and their charts compared with the truth."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from hmt_slam_ros.simulation.scenario import Scenario
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 LASER = "field_of_view=360,beams=720"
-"""As the paper's robot has it."""
+"""The laser of the paper's robot."""
 
 PEOPLE = 4
-"""Who walk about."""
+"""Number of people."""
 
 NEAR = 1.0
 """Largest distance from a state to the node of the chart that is it, m."""
@@ -36,9 +36,9 @@ class InstituteMap(NamedTuple):
     :ivar scenario: the drive.
     :ivar hybrid_map: the map at its end.
     :ivar scans: {keyframe: scan}.
-    :ivar views: {area: what its keyframes show}.
+    :ivar views: {area: view of its keyframes}.
     :ivar chart: of the map.
-    :ivar frames: {area: ``world_T_area`` (3,)}, that in which the area's keyframes are nearest to where they were.
+    :ivar frames: {area: ``world_T_area`` (3,)}, the best fit to the true poses of the area's keyframes.
     """
 
     scenario: Scenario
@@ -55,19 +55,19 @@ class InstituteMap(NamedTuple):
         return np.array(poses).reshape(-1, 3)
 
 
-class Judged(NamedTuple):
-    """A chart against the truth.
+class ChartScores(NamedTuple):
+    """The scores of a chart.
 
-    :ivar states: how many there are.
-    :ivar detected: how many of these are nodes.
-    :ivar confused: how many nodes are confused.
-    :ivar off: distances of nodes from their states, m.
+    :ivar states: number of true states.
+    :ivar detected: number of true states that have a node.
+    :ivar confused: number of nodes of a wrong kind, or at no state.
+    :ivar offsets: distances of nodes from their states, m.
     """
 
     states: int
     detected: int
     confused: int
-    off: list[float]
+    offsets: list[float]
 
 
 def scenario_of(seed: int, visit: int = 0, changed: float = 0.0, people: int = PEOPLE) -> Scenario:
@@ -76,7 +76,7 @@ def scenario_of(seed: int, visit: int = 0, changed: float = 0.0, people: int = P
     return open_simulated(f"sim:institute,{own}").scenario
 
 
-def mapped(seed: int, configuration: Configuration, visit: int = 0, people: int = PEOPLE) -> InstituteMap:
+def map_institute(seed: int, configuration: Configuration, visit: int = 0, people: int = PEOPLE) -> InstituteMap:
     """Map the scripted drive."""
     own = f"seed={seed},visit={visit},changed=0,laps=1,people={people},{LASER}"
     log = open_simulated(f"sim:institute,{own}")
@@ -84,17 +84,17 @@ def mapped(seed: int, configuration: Configuration, visit: int = 0, people: int 
     recording = result.recorder.finish(
         result.log_progress.stamps, result.log_progress.first_scans, result.log_progress.earlier_trajectory
     )
-    return charted(log.scenario, recording.hybrid_map, recording.replica.scans, log.true_poses, configuration)
+    return chart_map(log.scenario, recording.hybrid_map, recording.replica.scans, log.true_poses, configuration)
 
 
-def charted(
+def chart_map(
     scenario: Scenario,
     hybrid_map: HybridMap,
     scans: Mapping[int, Scan],
     true_poses: Callable[[Int64], Float64],
     configuration: Configuration,
 ) -> InstituteMap:
-    """A map and its chart.
+    """Make the chart of a map.
 
     :param scans: {keyframe: scan}.
     :param true_poses: gives ``world_T_base`` (n, 3) at stamps (n,), ns.
@@ -103,22 +103,22 @@ def charted(
     frames = {}
     for area in hybrid_map.area_ids():
         own_poses = hybrid_map.keyframes(area)
-        true = true_poses(np.array([scans[keyframe].stamp for keyframe in own_poses]))
-        frames[area] = se2.best_fit(stack_poses(own_poses), true)
+        true_poses_of_keyframes = true_poses(np.array([scans[keyframe].stamp for keyframe in own_poses]))
+        frames[area] = se2.best_fit(stack_poses(own_poses), true_poses_of_keyframes)
     return InstituteMap(
         scenario, hybrid_map, scans, views, build_chart(hybrid_map, views, configuration.features), frames
     )
 
 
-def judged(institute: InstituteMap) -> Judged:
-    """A chart beside the truth."""
+def score_chart(institute: InstituteMap) -> ChartScores:
+    """Compare a chart with the truth."""
     states, nodes = institute.scenario.building.states, institute.chart.nodes
-    away = np.hypot(*(institute.nodes[:, None, :2] - states.poses[None, :, :2]).transpose(2, 0, 1))
+    distances = np.hypot(*(institute.nodes[:, None, :2] - states.poses[None, :, :2]).transpose(2, 0, 1))
     inner = np.array([node.kind != END for node in nodes])
     crossing = np.array([node.kind == CROSSING for node in nodes])
-    own = away.argmin(axis=1)
-    near = inner & (away.min(axis=1) <= NEAR)
-    right = near & (states.crossings[own] == crossing)
-    found = len(set(own[near].tolist()))
-    off = away[near].min(axis=1).tolist()
-    return Judged(len(states.poses), found, int((inner & ~right).sum()), off)
+    nearest = distances.argmin(axis=1)
+    near = inner & (distances.min(axis=1) <= NEAR)
+    is_right = near & (states.crossings[nearest] == crossing)
+    detected = len(set(nearest[near].tolist()))
+    offsets = distances[near].min(axis=1).tolist()
+    return ChartScores(len(states.poses), detected, int((inner & ~is_right).sum()), offsets)

@@ -1,4 +1,4 @@
-"""Recovery of a robot that is carried elsewhere while it drives: delay and correctness."""
+"""Recovery of a kidnapped robot: delay and correctness."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmark.logs import opened
+from benchmark.logs import open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
@@ -31,48 +31,47 @@ from hmt_slam_ros.sensors import Scan
 WORLDS = ("office", "busy", "nested", "hall", "ring")
 LOGS = ("aces", "intel")
 ALIKE = ("hall", "ring")
-"""Worlds in which a robot may see the same where it is put as where it would be, or nothing."""
+"""Worlds in which a kidnapping may be invisible, because the view is the same or empty."""
 
 KINDS = ("known", "unknown", "short")
 SEEDS = 10
 
 SOON, SHARE = 5.0, 0.95
-"""m of travel within which it is to be noticed, and in what share of the cases."""
+"""Path within which a kidnapping has to be detected, m, and smallest share of the cases."""
 
-SURE, DOUBT = 0.9, 0.1
-"""Probability of its place from which on a robot is sure, and that of being lost up to which it says that it knows."""
+SURE, LOST_LIMIT = 0.9, 0.1
+"""Smallest probability of the place of a sure robot, and largest one of being lost of a localized robot."""
 
 _RIGHT, _RIGHT_ANGLE, _DRIFT = 0.5, math.radians(10.0), 0.03
 _DRAWS = 2009
 _JUMP = 0.6  # m and rad, in the time between two scans
-_STEP = 2.5  # m, that a robot is carried which is only turned and put aside
-# Part of the drive after which the robot is carried, and from which it goes on.
+_STEP = 2.5  # m, by which a robot is moved in short kidnappings
+# Parts of the drive after which the robot is kidnapped, and from which it continues.
 _AT = {"known": (0.55, 0.7), "unknown": (0.15, 0.25), "short": (0.2, 0.7)}
 _TO = {"known": (0.72, 0.85), "unknown": (0.3, 0.4)}
 
 POLICY = (
-    "Two rounds of each world. The robot is carried once, its odometry says nothing of it, and it is put down turned "
-    "by up to 180 degrees: in the second round to another part of it (known), in the first one to ground that it has "
-    f"not seen (unknown), or {_STEP:g} m farther on its way (short). It has noticed where it says "
-    "that it does not know its place, or is right. It is sure where hypotheses in which it is not lost have a "
-    f"probability of {SURE:g}, and right "
-    f"within {_RIGHT:g} m and {math.degrees(_RIGHT_ANGLE):.0f} degrees of where the map has the nearest keyframe of "
-    f"before, {100 * _DRIFT:g} % of the distance to that added. Errors are those of metric SLAM's trajectory at "
-    "relations within what was driven before and after. False alarms are metres on which a robot that nobody "
-    "carried says that it does not know its place. In hall and ring it may see the same where it is put, or nothing."
+    "Two rounds of each world. The robot is kidnapped once, without odometry, and turned by up to 180 degrees: in the "
+    f"second round to another part of it (known), in the first one to unmapped ground (unknown), or {_STEP:g} m "
+    "farther on its route (short). The kidnapping is noticed when the robot is not localized, or right. The robot is "
+    f"sure if hypotheses that are not lost have a probability of {SURE:g}. It is right within {_RIGHT:g} m and "
+    f"{math.degrees(_RIGHT_ANGLE):.0f} degrees of the pose by the nearest keyframe of before, with {100 * _DRIFT:g} % "
+    "of the distance to that added. Errors are those of metric SLAM's trajectory at relations within the parts before "
+    "and after. False alarms are meters on which a robot that was not kidnapped is not localized. In hall and ring the "
+    "view after the kidnapping may be the same, or empty."
 )
 
 
 @dataclass(frozen=True)
 class Kidnapping:
-    """What came of one drive.
+    """The scores of one drive.
 
-    :ivar noticed: m of travel until the robot was not sure of its place, or right again; inf where it never was.
-    :ivar again: m of travel until it was sure of the right place and stayed so; inf where it never was.
-    :ivar confident: m of travel on which it was sure of a wrong place, after it was noticed.
-    :ivar wrong: whether it was so at the end.
-    :ivar errors: mean error of translation at the relations of what was driven before and after, m.
-    :ivar driven: m, after.
+    :ivar noticed: path until the robot was not localized, or right again, m; inf if it never was.
+    :ivar again: path until it was sure of the right place and stayed so, m; inf if it never was.
+    :ivar confident: path after the detection on which it was sure of a wrong place, m.
+    :ivar wrong: whether it was sure of a wrong place at the end.
+    :ivar errors: mean error of translation at relations before and after the kidnapping, m.
+    :ivar driven: path after the kidnapping, m.
     """
 
     noticed: float
@@ -83,8 +82,8 @@ class Kidnapping:
     driven: float
 
 
-def drawn(world: str, kind: str, seed: int) -> str:
-    """The name of a simulated drive in which the robot is carried."""
+def draw_drive(world: str, kind: str, seed: int) -> str:
+    """The name of a random simulated drive with a kidnapping."""
     random = np.random.Generator(np.random.Philox(key=[_DRAWS + seed, KINDS.index(kind)]))
     at, turned = random.uniform(*_AT[kind]), random.uniform(-180.0, 180.0)
     name = f"{SIMULATION_PREFIX}{world},seed={seed},laps=2"
@@ -99,52 +98,55 @@ def drawn(world: str, kind: str, seed: int) -> str:
     return f"{name},carried={at:.4f},to={to:.4f},turned={turned:.1f}"
 
 
-class Heard(NamedTuple):
-    """What a robot said of its place at a keyframe event.
+class LocalizationReport(NamedTuple):
+    """The localization of a robot at a keyframe event.
 
-    :ivar travelled: m, since it was carried.
-    :ivar localized: whether it says that it knows its place.
-    :ivar sure: whether it is sure of it.
-    :ivar right: whether its estimate is right.
+    :ivar traveled: path since the kidnapping, m.
+    :ivar localized: whether lost hypotheses have a probability of ``LOST_LIMIT`` at most.
+    :ivar is_sure: whether hypotheses that are not lost have the probability ``SURE``.
+    :ivar is_right: whether its estimate is right.
     """
 
-    travelled: float
+    traveled: float
     localized: bool
-    sure: bool
-    right: bool
+    is_sure: bool
+    is_right: bool
 
 
-class Watched:
-    """A run, and what it says of the robot's place.
+class MonitoredRun:
+    """A run with the truth, which reports its localization.
 
     :ivar run: the five processes.
     :ivar true: {keyframe event: ``world_T_base`` (3,)}.
-    :ivar carried: the first keyframe event after the robot was carried, -1 before.
+    :ivar kidnap_event: the first keyframe event after the kidnapping, -1 before.
     """
 
     def __init__(self, changes: Sequence[str] = ()) -> None:
         """:param changes: parameters that differ from the file, as ``name=value``."""
         self.run = LockStepRun(load_configuration(PARAMETERS, list(changes)))
         self.true: dict[int, NDArray[np.float64]] = {}
-        self.carried = -1
+        self.kidnap_event = -1
 
     @property
     def events(self) -> int:
-        """Keyframe events so far."""
+        """Number of keyframe events."""
         return len(self.run.recorder.keyframes)
 
-    def lost(self) -> float:
-        """Probability that the robot may be anywhere."""
+    def lost_probability(self) -> float:
+        """Probability of the lost hypotheses."""
         hypotheses = self.run.recorder.hypotheses
-        return sum(leaf.probability for leaf in hypotheses[max(hypotheses)].hypotheses if leaf.lost)
+        return sum(hypothesis.probability for hypothesis in hypotheses[max(hypotheses)].hypotheses if hypothesis.lost)
 
-    def sure(self) -> bool:
-        """Whether the robot is sure of its place."""
+    def is_sure(self) -> bool:
+        """Whether hypotheses that are not lost have the probability ``SURE``."""
         hypotheses = self.run.recorder.hypotheses
-        return sum(leaf.probability for leaf in hypotheses[max(hypotheses)].hypotheses if not leaf.lost) >= SURE
+        return (
+            sum(hypothesis.probability for hypothesis in hypotheses[max(hypotheses)].hypotheses if not hypothesis.lost)
+            >= SURE
+        )
 
-    def right(self, true: NDArray[np.float64]) -> bool:
-        """Whether the last estimate is where the map of before has the robot.
+    def is_right(self, true: NDArray[np.float64]) -> bool:
+        """Whether the last estimate agrees with the map of before the kidnapping.
 
         :param true: ``world_T_base``, shape (3,).
         """
@@ -153,84 +155,84 @@ class Watched:
         hybrid_map, areas = slam.replica.maps[slam.replica.best_hypothesis], self._areas()
         if last is None or last.area not in areas:
             return False
-        placed = {
+        keyframe_poses = {
             keyframe: se2.compose(areas[area], pose)
             for area in hybrid_map.area_ids()
             for keyframe, pose in hybrid_map.keyframes(area).items()
-            if keyframe < self.carried and area in areas
+            if keyframe < self.kidnap_event and area in areas
         }
-        away = {k: math.hypot(*(self.true[k] - true)[:2]) for k in placed}
-        nearest = min(away, key=lambda k: away[k])
-        expected = se2.compose(placed[nearest], se2.between(self.true[nearest], true))
-        off = se2.between(expected, se2.compose(areas[last.area], last.pose.mean))
-        near = math.hypot(off[0], off[1]) <= _RIGHT + _DRIFT * away[nearest]
-        return bool(near and abs(off[2]) <= _RIGHT_ANGLE)
+        distances = {k: math.hypot(*(self.true[k] - true)[:2]) for k in keyframe_poses}
+        nearest = min(distances, key=lambda k: distances[k])
+        expected = se2.compose(keyframe_poses[nearest], se2.between(self.true[nearest], true))
+        error = se2.between(expected, se2.compose(areas[last.area], last.pose.mean))
+        near = math.hypot(error[0], error[1]) <= _RIGHT + _DRIFT * distances[nearest]
+        return bool(near and abs(error[2]) <= _RIGHT_ANGLE)
 
     def _areas(self) -> dict[int, NDArray[np.float64]]:
-        """{area: ``map_T_area``, shape (3,)} as TLCA told last."""
+        """{area: ``map_T_area``, shape (3,)} of the last closure decision with poses."""
         decisions = self.run.recorder.decisions
         for sequence in sorted(decisions, reverse=True):
             if decisions[sequence].global_poses:
                 return {entry.area: entry.pose.mean for entry in decisions[sequence].global_poses}
         return {}
 
-    def hear(self, true: NDArray[np.float64], travelled: float) -> Heard | None:
-        """What is said at a keyframe event, None where the last scan was none or nobody carried the robot yet."""
+    def report(self, true: NDArray[np.float64], traveled: float) -> LocalizationReport | None:
+        """The report at a keyframe event after the kidnapping; None for other scans."""
         if self.events - 1 in self.true:
             return None
         self.true[self.events - 1] = true
-        if self.carried < 0:
+        if self.kidnap_event < 0:
             return None
-        return Heard(travelled, self.lost() <= DOUBT, self.sure(), self.right(true))
+        return LocalizationReport(traveled, self.lost_probability() <= LOST_LIMIT, self.is_sure(), self.is_right(true))
 
 
-def kidnapped(name: str, changes: Sequence[str] = ()) -> Kidnapping:
-    """Drive through a simulated world in which the robot is carried."""
-    watched, travelled = Watched(changes), 0.0
-    heard: list[Heard] = []
+def drive_kidnapped(name: str, changes: Sequence[str] = ()) -> Kidnapping:
+    """Drive through a simulated world with a kidnapping."""
+    monitored, traveled = MonitoredRun(changes), 0.0
+    reports: list[LocalizationReport] = []
     stamps, truth, parts = list[int](), list[NDArray[np.float64]](), list[bool]()
     for record in open_log(name).records():
-        before = watched.events
-        watched.run.process_record(record)
+        before = monitored.events
+        monitored.run.process_record(record)
         if not isinstance(record.measurement, Scan) or record.true_pose is None:
             continue
         step = se2.between(truth[-1], record.true_pose) if truth else np.zeros(3)
         if math.hypot(step[0], step[1]) > _JUMP or abs(step[2]) > _JUMP:
-            watched.carried = before
-        elif watched.carried >= 0:
-            travelled += math.hypot(step[0], step[1])
+            monitored.kidnap_event = before
+        elif monitored.kidnap_event >= 0:
+            traveled += math.hypot(step[0], step[1])
         stamps.append(record.measurement.stamp)
         truth.append(record.true_pose)
-        parts.append(watched.carried >= 0)
-        said = watched.hear(record.true_pose, travelled)
-        heard += [] if said is None else [said]
-    result = watched.run.finish()
+        parts.append(monitored.kidnap_event >= 0)
+        report = monitored.report(record.true_pose, traveled)
+        reports += [] if report is None else [report]
+    result = monitored.run.finish()
     recording = result.recorder.finish(result.log_progress.stamps)
     own, true = StampedPoses(recording.stamps, recording.trajectory), StampedPoses(np.array(stamps), np.array(truth))
     errors = [_error(own, true, np.array(parts) == part) for part in (False, True)]
-    return judged(heard, (errors[0], errors[1]), travelled)
+    return summarize_drive(reports, (errors[0], errors[1]), traveled)
 
 
-def judged(heard: Sequence[Heard], errors: tuple[float, float], travelled: float) -> Kidnapping:
-    """What came of a drive.
+def summarize_drive(reports: Sequence[LocalizationReport], errors: tuple[float, float], traveled: float) -> Kidnapping:
+    """The scores of a drive.
 
-    :param heard: after the robot was carried, at least once.
-    :param errors: before and after, m.
-    :param travelled: after, m.
+    :param reports: after the kidnapping, at least one.
+    :param errors: before and after the kidnapping, m.
+    :param traveled: path after the kidnapping, m.
     """
-    noticed = next((said.travelled for said in heard if not said.localized or said.right), math.inf)
+    noticed = next((report.traveled for report in reports if not report.localized or report.is_right), math.inf)
     again = math.inf
-    for said in reversed(heard):
-        if not (said.sure and said.right):
+    for report in reversed(reports):
+        if not (report.is_sure and report.is_right):
             break
-        again = said.travelled
+        again = report.traveled
     wrong = [
-        later.travelled - said.travelled
-        for said, later in pairwise(heard)
-        if said.travelled > noticed and said.sure and not said.right
+        later.traveled - report.traveled
+        for report, later in pairwise(reports)
+        if report.traveled > noticed and report.is_sure and not report.is_right
     ]
-    last = heard[-1]
-    return Kidnapping(noticed, again, sum(wrong), last.sure and not last.right, errors, travelled)
+    last = reports[-1]
+    return Kidnapping(noticed, again, sum(wrong), last.is_sure and not last.is_right, errors, traveled)
 
 
 def _error(own: StampedPoses, truth: StampedPoses, chosen: NDArray[np.bool_]) -> float:
@@ -240,86 +242,93 @@ def _error(own: StampedPoses, truth: StampedPoses, chosen: NDArray[np.bool_]) ->
 
 
 @dataclass(frozen=True)
-class Alarm:
-    """An ordinary drive.
+class OrdinaryDrive:
+    """The scores of a drive without a kidnapping.
 
     :ivar driven: m.
-    :ivar doubted: m of that on which the robot said that it does not know its place.
+    :ivar unsure: path on which the robot was not localized, m.
     """
 
     driven: float
-    doubted: float
+    unsure: float
 
 
-def ordinary(path: Path | str, changes: Sequence[str] = ()) -> Alarm:
-    """Drive where nobody carries the robot."""
-    watched, driven, doubted = Watched(changes), 0.0, 0.0
+def drive_ordinary(path: Path | str, changes: Sequence[str] = ()) -> OrdinaryDrive:
+    """Drive without a kidnapping."""
+    monitored, driven, unsure = MonitoredRun(changes), 0.0, 0.0
     for record in open_log(path).records():
-        before = watched.events
-        watched.run.process_record(record)
-        if watched.events > before:
-            travelled = watched.run.recorder.keyframes[watched.events - 1].path_length
-            doubted += (travelled - driven) * (watched.lost() > DOUBT)
-            driven = travelled
-    return Alarm(driven, doubted)
+        before = monitored.events
+        monitored.run.process_record(record)
+        if monitored.events > before:
+            traveled = monitored.run.recorder.keyframes[monitored.events - 1].path_length
+            unsure += (traveled - driven) * (monitored.lost_probability() > LOST_LIMIT)
+            driven = traveled
+    return OrdinaryDrive(driven, unsure)
 
 
 def measure_kidnapping(settings: Settings) -> Report:
-    """Carry the robot in every world, and drive where nobody does."""
+    """Drive in every world, with and without kidnappings."""
     seeds = settings.seeds_or(SEEDS)
-    report = Report("kidnapping", "A robot that is carried while it drives", seeds=seeds)
+    report = Report("kidnapping", "A robot that is kidnapped while it drives", seeds=seeds)
     names = settings.logs_or((*WORLDS, *LOGS))
     worlds = [name for name in names if name in WORLDS]
     cases = [(world, kind, seed) for world in worlds for kind in KINDS for seed in seeds]
-    with opened([name for name in names if name not in WORLDS]) as logs:
+    with open_logs([name for name in names if name not in WORLDS]) as logs:
         drives: list[tuple[str, Path | str]] = [(log.name, log.path) for log in logs]
         drives += [(world, f"{SIMULATION_PREFIX}{world},seed={seed},laps=2") for world in worlds for seed in seeds]
         with ProcessPoolExecutor(settings.runner.jobs, multiprocessing.get_context("spawn")) as pool:
             changes = settings.changes
-            found = list(pool.map(partial(kidnapped, changes=changes), [drawn(*case) for case in cases]))
-            alarms = list(pool.map(partial(ordinary, changes=changes), [path for _, path in drives]))
+            found = list(pool.map(partial(drive_kidnapped, changes=changes), [draw_drive(*case) for case in cases]))
+            ordinary_drives = list(pool.map(partial(drive_ordinary, changes=changes), [path for _, path in drives]))
     rows = []
     for world in worlds:
         for kind in KINDS:
-            own = [one for one, case in zip(found, cases, strict=True) if case[:2] == (world, kind)]
-            rows.append([world, kind, *_cells(own)])
-            report.data[f"{world} {kind}"] = [asdict(one) for one in own]
+            kidnappings = [
+                kidnapping for kidnapping, case in zip(found, cases, strict=True) if case[:2] == (world, kind)
+            ]
+            rows.append([world, kind, *_drive_cells(kidnappings)])
+            report.data[f"{world} {kind}"] = [asdict(kidnapping) for kidnapping in kidnappings]
             if world not in ALIKE:
-                report.requirements += requirements(f"{world}, {kind}", own)
-    head = ["world", "carried to", "drives", f"noticed within {SOON:g} m", "m until noticed, median"]
+                report.requirements += requirements(f"{world}, {kind}", kidnappings)
+    head = ["world", "kidnapped to", "drives", f"noticed within {SOON:g} m", "m until noticed, median"]
     head += ["right at the end", "m until right, median", "m sure of a wrong place", "wrong at the end"]
     head += ["error before [m]", "after [m]"]
     report.body.append(table(head, rows))
     rows = []
     for name in dict.fromkeys(name for name, _ in drives):
-        told = [alarm for alarm, (drive, _) in zip(alarms, drives, strict=True) if drive == name]
-        driven, doubted = sum(alarm.driven for alarm in told), sum(alarm.doubted for alarm in told)
-        rows.append([name, str(len(told)), f"{driven / 1e3:.2f}", f"{1e3 * doubted / driven:.1f}"])
-        report.requirements.append(Requirement(f"{name}: m not sure of the place per km", 1e3 * doubted / driven, 0.0))
-        report.data[f"{name} ordinary"] = [asdict(alarm) for alarm in told]
+        drives_of_log = [
+            drive_scores for drive_scores, (drive, _) in zip(ordinary_drives, drives, strict=True) if drive == name
+        ]
+        driven, unsure = (
+            sum(drive_scores.driven for drive_scores in drives_of_log),
+            sum(drive_scores.unsure for drive_scores in drives_of_log),
+        )
+        rows.append([name, str(len(drives_of_log)), f"{driven / 1e3:.2f}", f"{1e3 * unsure / driven:.1f}"])
+        report.requirements.append(Requirement(f"{name}: m not sure of the place per km", 1e3 * unsure / driven, 0.0))
+        report.data[f"{name} ordinary"] = [asdict(drive_scores) for drive_scores in drives_of_log]
     report.body += [table(["ordinary drive", "drives", "km", "m not sure of the place per km"], rows), POLICY]
     return report
 
 
 def requirements(name: str, found: Sequence[Kidnapping]) -> list[Requirement]:
-    """What is asked for: that it is noticed soon, and that no wrong place is taken for certain."""
-    noticed = float(np.mean([one.noticed <= SOON for one in found]))
-    wrong = sum(one.confident > 0.0 or one.wrong for one in found)
+    """Requirements on the delay of detections, and on confident wrong answers."""
+    noticed = float(np.mean([kidnapping.noticed <= SOON for kidnapping in found]))
+    wrong = sum(kidnapping.confident > 0.0 or kidnapping.wrong for kidnapping in found)
     return [
         Requirement(f"{name}: noticed within {SOON:g} m", noticed, 1.0, least=SHARE),
         Requirement(f"{name}: drives with a confident wrong answer", wrong, 0),
     ]
 
 
-def _cells(found: Sequence[Kidnapping]) -> list[str]:
-    again = [one.again for one in found]
+def _drive_cells(found: Sequence[Kidnapping]) -> list[str]:
+    recoveries = [kidnapping.again for kidnapping in found]
     return [
         str(len(found)),
-        f"{np.mean([one.noticed <= SOON for one in found]):.2f}",
-        f"{np.median([one.noticed for one in found]):.1f}",
-        str(sum(not math.isinf(one) for one in again)),
-        f"{np.median(again):.1f}",
-        f"{np.mean([one.confident for one in found]):.1f}",
-        str(sum(one.wrong for one in found)),
-        *(f"{np.mean([one.errors[k] for one in found]):.3f}" for k in (0, 1)),
+        f"{np.mean([kidnapping.noticed <= SOON for kidnapping in found]):.2f}",
+        f"{np.median([kidnapping.noticed for kidnapping in found]):.1f}",
+        str(sum(not math.isinf(kidnapping) for kidnapping in recoveries)),
+        f"{np.median(recoveries):.1f}",
+        f"{np.mean([kidnapping.confident for kidnapping in found]):.1f}",
+        str(sum(kidnapping.wrong for kidnapping in found)),
+        *(f"{np.mean([kidnapping.errors[k] for kidnapping in found]):.3f}" for k in (0, 1)),
     ]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import multiprocessing
-import resource
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -12,11 +11,11 @@ from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
-from benchmark.logs import opened
+from benchmark.charted_run import resident_bytes
+from benchmark.logs import open_logs
 from benchmark.report import Report, Requirement, table
-from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
-from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.evaluation import (
     Relations,
     StampedPoses,
@@ -36,42 +35,41 @@ from hmt_slam_ros.sensors import Scan
 
 WORLDS = ("office", "nested", "hall")
 LAPS, STEADY = 20, 3
-"""Laps of a simulated world, and after how many the memory is compared with that at the end."""
+"""Number of laps of a simulated world, and the lap from which on growth is measured."""
 
 LOGS = ("intel",)
 PASSES = 3
-"""How often a real log is played."""
+"""Number of passes of a real log."""
 
 GROWTH = 0.05
 """Largest growth of areas, keyframes and memory."""
 
 NOISE = 0.1
-"""Largest growth of what a scan costs, and of errors: they differ by as much from lap to lap."""
+"""Largest growth of the cost of a scan, and of errors, which vary as much between laps."""
 
 _BETWEEN = 60 * NANOSECONDS
 
 POLICY = (
-    f"One run of {LAPS} laps of each world (seed 0), and one in which a log of a real robot is played {PASSES} times: "
-    "from its end the robot is carried to its beginning, is not told where it is, and maps on until it is recognized. "
-    f"The growth is that from lap {STEADY} to the last, of a log from its first pass to the last. Areas and keyframes "
-    "are those of the most probable map. Memory is what is resident of the one OS process in which all five processes "
-    "run, libraries and kernels included, after a collection of garbage, less what is recorded: pose, stamps and costs "
-    "of every scan, some 200 bytes, which are the output and which none of the five keeps. The cost of a scan is CPU "
-    "time of the processes. Errors are those of metric SLAM's "
-    "trajectory in the map at the end, before the final refinement, at relations within the lap."
+    f"One run of {LAPS} laps of each world (seed 0), and one in which a real log is played {PASSES} times. At the end "
+    "of each pass the robot is put at the beginning without an initial pose, and maps on until it is relocalized. The "
+    f"growth is that from lap {STEADY} to the last, of a log from its first pass to the last. Areas and keyframes are "
+    "those of the most probable map. Memory is the resident memory of the one OS process with all five processes, "
+    "libraries and kernels, after a garbage collection. The recorded poses, stamps and costs of every scan, some 200 "
+    "bytes for the output, are subtracted. The cost of a scan is CPU time of the processes. Errors are those of metric "
+    "SLAM's trajectory in the final map, before the final refinement, at relations within the lap."
 )
 
 
 @dataclass(frozen=True)
 class Lap:
-    """What a run came to after a lap.
+    """The size of a run after a lap.
 
     :ivar areas: of the most probable map.
     :ivar keyframes: likewise.
     :ivar scans: kept in memory.
-    :ivar scan_bytes: what they take.
+    :ivar scan_bytes: memory of these.
     :ivar resident: memory of the OS process, bytes.
-    :ivar recorded: of which are trajectories, for the output, bytes.
+    :ivar recorded: part of it for trajectories of the output, bytes.
     :ivar hypotheses: alive.
     :ivar milliseconds: of computing for a scan of the lap, mean.
     """
@@ -98,23 +96,23 @@ class Laps:
     errors: tuple[float, ...]
 
     def growth(self, value: Callable[[Lap], float], steady: int) -> float:
-        """From the end of lap ``steady`` to that of the last one, as a share."""
+        """Growth of a value from the end of lap ``steady`` to that of the last one, as a share."""
         return value(self.laps[-1]) / value(self.laps[steady - 1]) - 1.0
 
 
 def measure_laps(settings: Settings) -> Report:
     """Drive the laps, and compare the last with the first."""
-    report = Report("laps", "Known ground again and again", seeds=(0,))
-    configuration = load_configuration(PARAMETERS, list(settings.changes))
+    report = Report("laps", "Repeated laps on known ground", seeds=(0,))
+    configuration = settings.configuration
     names = settings.logs_or((*WORLDS, *LOGS))
-    with opened([name for name in names if name not in WORLDS]) as logs:
-        asked: dict[str, tuple[str, Path | None, int]] = {
+    with open_logs([name for name in names if name not in WORLDS]) as logs:
+        jobs: dict[str, tuple[str, Path | None, int]] = {
             name: (f"{SIMULATION_PREFIX}{name},laps={LAPS}", None, LAPS) for name in names if name in WORLDS
         }
-        asked |= {log.name: (str(log.path), log.relations_file, PASSES) for log in logs}
-        # A process of its own for each: memory is what it takes.
+        jobs |= {log.name: (str(log.path), log.relations_file, PASSES) for log in logs}
+        # Memory is measured for a separate process of each.
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), max_tasks_per_child=1) as pool:
-            runs = {name: pool.submit(driven, *what, configuration) for name, what in asked.items()}
+            runs = {name: pool.submit(drive_laps, *job, configuration) for name, job in jobs.items()}
             found = {name: run.result() for name, run in runs.items()}
     for name, laps in found.items():
         report.requirements += requirements(name, laps)
@@ -124,7 +122,7 @@ def measure_laps(settings: Settings) -> Report:
 
 
 def requirements(name: str, found: Laps) -> list[Requirement]:
-    """What is asked for of a run: that what it holds, what a scan costs and what it errs are the same in late laps."""
+    """Requirements on the growth of a run: its areas, keyframes, memory, cost of a scan and error."""
     count = len(found.laps)
     steady = STEADY if count > STEADY else 1
     since = f"{name}, lap {steady} to {count}: growth of"
@@ -138,41 +136,43 @@ def requirements(name: str, found: Laps) -> list[Requirement]:
     ]
 
 
-def driven(log: str, relations: Path | None, count: int, configuration: Configuration) -> Laps:
-    """Drive over a log ``count`` times, or over a simulated one that has as many laps."""
+def drive_laps(log: str, relations: Path | None, count: int, configuration: Configuration) -> Laps:
+    """Drive over a log ``count`` times, or over a simulated log with as many laps."""
     gc.freeze()
     source, run = open_log(log), LockStepRun(configuration)
     times = 1 if relations is None else count
     ends = [round(source.scan_count * times * (lap + 1) / count) for lap in range(count)]
     laps: list[Lap] = []
     begin = time.process_time()
-    for record, carried in _passes(source, times):
-        if carried:
+    for record, is_restart in _replay(source, times):
+        if is_restart:
             run.lock_step.feed(PoseReset())
         run.process_record(record)
         run.recorder.compact()
         if isinstance(record.measurement, Scan) and run.scans_read == ends[len(laps)]:
             seconds = time.process_time() - begin
-            laps.append(_lap(run, seconds / (ends[len(laps)] - ([0, *ends][len(laps)]))))
+            laps.append(_measure_lap(run, seconds / (ends[len(laps)] - ([0, *ends][len(laps)]))))
             begin = time.process_time()
     known = None if relations is None else read_relations(relations)
-    return Laps(tuple(laps), tuple(_errors(run, source, known, ends)))
+    return Laps(tuple(laps), tuple(_lap_errors(run, source, known, ends)))
 
 
-def _passes(log: Log, count: int) -> Iterator[tuple[LogRecord, bool]]:
-    """The records of a log, over and over on one clock, and whether the robot was carried before each."""
+def _replay(log: Log, count: int) -> Iterator[tuple[LogRecord, bool]]:
+    """The records of repeated passes of a log on one clock, each with whether a pass begins."""
     shift = stamp = 0
     for number in range(count):
         for n, record in enumerate(log.records()):
-            again = number > 0 and n == 0
-            if again:
+            is_restart = number > 0 and n == 0
+            if is_restart:
                 shift = stamp + _BETWEEN - record.measurement.stamp
             stamp = record.measurement.stamp + shift
-            yield replace(record, measurement=replace(record.measurement, stamp=stamp)), again
+            yield replace(record, measurement=replace(record.measurement, stamp=stamp)), is_restart
 
 
-def _lap(run: LockStepRun, seconds: float) -> Lap:
-    """What a run is after a lap in which a scan took so many seconds."""
+def _measure_lap(run: LockStepRun, seconds: float) -> Lap:
+    """The size of a run after a lap.\n
+    :param seconds: mean cost of a scan of the lap.
+    """
     gc.collect()
     slam = run.lock_step.processes["slam"]
     assert isinstance(slam, MetricSlam)
@@ -180,20 +180,14 @@ def _lap(run: LockStepRun, seconds: float) -> Lap:
     hybrid_map, scans = replica.maps[replica.best_hypothesis], replica.scans
     areas = hybrid_map.area_ids()
     keyframes = sum(len(hybrid_map.keyframes(area)) for area in areas)
-    memory = (scan_bytes(scans.values()), _resident(), run.recorded_bytes)
+    memory = (scan_bytes(scans.values()), resident_bytes(), run.recorded_bytes)
     return Lap(len(areas), keyframes, len(scans), *memory, len(replica.maps), 1e3 * seconds)
 
 
-def _resident() -> int:
-    """Memory of this OS process, bytes."""
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    return pages * resource.getpagesize()
-
-
-def _errors(run: LockStepRun, log: Log, known: Relations | None, ends: Sequence[int]) -> Iterator[float]:
+def _lap_errors(run: LockStepRun, log: Log, known: Relations | None, ends: Sequence[int]) -> Iterator[float]:
     """Mean error at the relations of each lap, m.
 
-    :param known: those of a log of a real robot; None where its records tell the truth.
+    :param known: true relations of a real log; None for a simulated one.
     :param ends: number of scans at the end of each lap.
     """
     result = run.finish()
@@ -213,7 +207,7 @@ def _table(found: Mapping[str, Laps]) -> str:
     head = ["log", "lap", "areas", "keyframes", "their scans [MB]", "resident [MB]", "recorded [MB]", "hypotheses"]
     rows = []
     for name, run in found.items():
-        for number in _shown(len(run.laps)):
+        for number in _tabulated_laps(len(run.laps)):
             lap = run.laps[number - 1]
             memory = (f"{lap.scan_bytes / 1e6:.1f}", f"{lap.resident / 1e6:.0f}", f"{lap.recorded / 1e6:.1f}")
             figures = [lap.areas, lap.keyframes, *memory]
@@ -222,6 +216,6 @@ def _table(found: Mapping[str, Laps]) -> str:
     return table([*head, "ms a scan", "error [m]"], rows)
 
 
-def _shown(count: int) -> list[int]:
-    """The laps that stand in the table: the first ones, then every fifth, and the last."""
+def _tabulated_laps(count: int) -> list[int]:
+    """The laps of the table: the first ones, every fifth, and the last."""
     return [lap for lap in range(1, count + 1) if lap <= STEADY or lap % 5 == 0 or lap == count]

@@ -1,6 +1,6 @@
-"""Hybrid maps of as many areas as wanted, made as data: a lattice of corridors, every crossing an area.
+"""Synthetic hybrid maps of any number of areas: a lattice of corridors, with an area at each crossing.
 
-All crossings are alike, so that a few scans serve all of them.
+All crossings are the same, so that they share a few scans.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ SPACING = 8.0
 """From crossing to crossing, m."""
 
 OFFSETS = (-3.2, -1.6, 0.0, 1.6, 3.2)
-"""Where keyframes are taken on the way through a crossing, m before or behind its centre."""
+"""Positions of keyframes along a crossing, m from its center."""
 
 PER_AREA = 2 * len(OFFSETS)
 """Keyframes of an area, half of them along each corridor."""
 
 FIRST_KEYFRAME = 10_000_000
-"""Of area 0; smaller ones are those of a run in the map."""
+"""First keyframe of area 0; smaller numbers are those of a run in the map."""
 
 BEAMS = 61
 
@@ -50,25 +50,25 @@ class Lattice(NamedTuple):
 
     @property
     def areas(self) -> int:
-        """How many."""
+        """Number of areas."""
         return self.columns * self.rows
 
     def hybrid_map(self) -> HybridMap:
         """The definite map: keyframes along both corridors of every crossing, and an arc to each of the next ones."""
         hybrid_map = HybridMap()
-        places = [_at(offset, quarter) for quarter in range(2) for offset in OFFSETS]
+        places = [_pose_in_crossing(offset, quarter) for quarter in range(2) for offset in OFFSETS]
         for area in range(self.areas):
             first = FIRST_KEYFRAME + PER_AREA * area
             hybrid_map.changed_areas[area] = {first + k: place.copy() for k, place in enumerate(places)}
             if (area + 1) % self.columns:
-                hybrid_map.set_arc(area, area + 1, _arc(SPACING, 0.0), closure=False)
+                hybrid_map.set_arc(area, area + 1, _make_arc(SPACING, 0.0), closure=False)
             if area + self.columns < self.areas:
-                hybrid_map.set_arc(area, area + self.columns, _arc(0.0, SPACING), closure=False)
+                hybrid_map.set_arc(area, area + self.columns, _make_arc(0.0, SPACING), closure=False)
         hybrid_map.commit()
         return hybrid_map
 
     def poses(self) -> tuple[AreaPose, ...]:
-        """Where the crossings lie, as TLCA says it."""
+        """Poses of the crossings, as of a closure decision."""
         at = (SPACING * np.array([area % self.columns, area // self.columns, 0.0]) for area in range(self.areas))
         return tuple(AreaPose(area, PoseGaussian(mean, ARC.copy())) for area, mean in enumerate(at))
 
@@ -81,32 +81,32 @@ class LatticeScans(dict[int, Scan]):
         return shared_scan(OFFSETS[offset], quarter)
 
 
-def _arc(x: float, y: float) -> PoseGaussian:
+def _make_arc(x: float, y: float) -> PoseGaussian:
     return PoseGaussian(np.array([x, y, 0.0]), ARC.copy())
 
 
-def _at(offset: float, quarter: int) -> Float64:
-    """``crossing_T_base`` on the way through it, in a heading of some quarters of a turn."""
+def _pose_in_crossing(offset: float, quarter: int) -> Float64:
+    """``crossing_T_base`` (3,) at an offset along a corridor, with a heading in quarter turns."""
     return np.asarray(se2.compose([0.0, 0.0, 0.5 * math.pi * quarter], [offset, 0.0, 0.0]))
 
 
 @cache
 def shared_scan(offset: float, quarter: int) -> Scan:
-    """The scan on the way through any crossing, one of ``OFFSETS`` from its centre."""
-    return scan_at(_at(offset, quarter), 0, quarter)
+    """The scan at one of ``OFFSETS`` along a corridor, which is the same at every crossing."""
+    return scan_at(_pose_in_crossing(offset, quarter), 0, quarter)
 
 
 def scan_at(pose: Float64, stamp: int, seed: int, beams: int = BEAMS) -> Scan:
-    """The scan at a pose (3,) in an endless lattice, of which a crossing lies at the origin."""
+    """The scan at a pose (3,) in an endless lattice with a crossing at the origin."""
     angles = np.linspace(-0.5 * _FIELD, 0.5 * _FIELD, beams)
     at = pose[:2] - SPACING * np.round(pose[:2] / SPACING)
-    ranges = cast_rays(_walls(), np.tile(at, (beams, 1)), angles + pose[2], np.inf)
+    ranges = cast_rays(_wall_index(), np.tile(at, (beams, 1)), angles + pose[2], np.inf)
     ranges = np.minimum(ranges + _NOISE * np.random.default_rng(seed).standard_normal(beams), _RANGE)
     return Scan(stamp, ranges.astype(np.float32), angles[0], angles[1] - angles[0], 0.05, _RANGE)
 
 
 @cache
-def _walls() -> WallIndex:
+def _wall_index() -> WallIndex:
     """The blocks between corridors of 2 m around a crossing, each with a niche on one side."""
     corners = [(1.0, 1.0), (4.0, 1.0), (4.0, 1.4), (5.0, 1.4), (5.0, 1.0), (7.0, 1.0), (7.0, 7.0), (1.0, 7.0)]
     block = np.array([[*a, *b] for a, b in pairwise([*corners, corners[0]])])
@@ -114,8 +114,8 @@ def _walls() -> WallIndex:
     return wall_index(np.concatenate([block + shift for shift in shifts]))
 
 
-class Stop(NamedTuple):
-    """A place for a keyframe on the way along some crossings.
+class LatticeStop(NamedTuple):
+    """A keyframe on a path along some crossings.
 
     :ivar pose: ``lattice_T_base``, shape (3,).
     :ivar scan: the shared one.
@@ -127,10 +127,12 @@ class Stop(NamedTuple):
     last: bool
 
 
-def stops(crossings: Sequence[tuple[int, int]]) -> Iterator[Stop]:
-    """The stops on the way from the centre of the first crossing (column, row) through the next ones."""
+def make_stops(crossings: Sequence[tuple[int, int]]) -> Iterator[LatticeStop]:
+    """The stops on the path from the center of the first crossing (column, row) through the next ones."""
     for (column, row), (next_column, next_row) in pairwise(crossings):
         quarter = round(math.atan2(next_row - row, next_column - column) / (0.5 * math.pi)) % 4
         for offset in OFFSETS:
-            centre = np.array([SPACING * next_column, SPACING * next_row, 0.0])
-            yield Stop(centre + _at(offset, quarter), shared_scan(offset, quarter), offset == OFFSETS[-1])
+            center = np.array([SPACING * next_column, SPACING * next_row, 0.0])
+            yield LatticeStop(
+                center + _pose_in_crossing(offset, quarter), shared_scan(offset, quarter), offset == OFFSETS[-1]
+            )

@@ -18,7 +18,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
-from benchmark.logs import WITH_RELATIONS, opened
+from benchmark.logs import WITH_RELATIONS, open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.running_nodes import Listener
 from benchmark.settings import Settings
@@ -38,68 +38,67 @@ FAST = "sim:office,rate=40,readings=3,beams=1080,field_of_view=270"
 """A drive with 40 scans a second of 1080 beams."""
 
 SECONDS = 60.0
-"""Of each drive."""
+"""Duration of each drive, s."""
 
 LATENCY = 0.010
 """Largest time from an odometry message to its pose, at 99 of 100, s."""
 
 BEHIND = 0.5
-"""How far behind metric SLAM may be in the end with the fast laser, s."""
+"""Largest delay of metric SLAM at the end with the fast laser, s."""
 
 RATE = 10.0
-"""Times real time at which logs are replayed."""
+"""Speed of replays relative to real time."""
 
 LATER = 1.1
-"""How much longer a replay may take than its log at that rate."""
+"""Largest ratio of the time of a replay to that of its log at that rate."""
 
-_PATIENCE = 3600.0
+_TIMEOUT = 3600.0
 
 POLICY = (
-    f"Every node is a process of its own, and messages go over DDS. Saturated: a drive of {SECONDS:.0f} s with 100 "
-    "odometry readings a second in real time, and beside the nodes as many processes as the machine has cores that do "
-    "nothing but compute. The latency is the time from when the odometry message is published until its pose is, by "
-    f"the time stamps of DDS. Fast laser: {SECONDS:.0f} s with 40 scans a second of 1080 beams; the delay is that from "
-    f"a scan to metric SLAM's estimate of its pose. Replays: the logs at {RATE:g} times real time, paced, so that the "
-    "robot waits where 20 scans are without an answer."
+    f"Every node is an OS process, and messages go over DDS. Saturated: a drive of {SECONDS:.0f} s with 100 odometry "
+    "readings a second in real time, with one process for every core that only computes. The latency is the time from "
+    "the publication of an odometry message to that of its pose, by the time stamps of DDS. Fast laser: "
+    f"{SECONDS:.0f} s with 40 scans a second of 1080 beams; the delay is that from a scan to metric SLAM's estimate. "
+    f"Replays: the logs at {RATE:g} times real time with flow control: the robot waits while 20 scans have no answer."
 )
 
 Stamped = dict[int, float]
 
 
-class Passed(NamedTuple):
-    """When messages were published, by the stamps in their headers.
+class MessageTimes(NamedTuple):
+    """Times at which messages were published, by the stamps in their headers.
 
-    :ivar asked: {stamp, ns: s}.
-    :ivar answered: likewise.
+    :ivar sent: {stamp, ns: s}.
+    :ivar received: likewise.
     """
 
-    asked: Stamped
-    answered: Stamped
+    sent: Stamped
+    received: Stamped
 
     @property
     def delays(self) -> NDArray[np.float64]:
-        """Of all that were answered, s."""
-        return np.array([moment - self.asked[stamp] for stamp, moment in self.answered.items() if stamp in self.asked])
+        """Delays of all answered messages, s."""
+        return np.array([moment - self.sent[stamp] for stamp, moment in self.received.items() if stamp in self.sent])
 
 
 def measure_live(settings: Settings) -> Report:
-    """Let the nodes keep up with a robot."""
-    report = Report("live", "Keeping time")
-    poses, scans = saturated(BUSY, SECONDS), fast(FAST, SECONDS)
-    asked = [
+    """Measure the delays of the nodes, with drives and with replays."""
+    report = Report("live", "Latency of the nodes")
+    poses, scans = measure_saturated(BUSY, SECONDS), measure_fast(FAST, SECONDS)
+    requirements = [
         Requirement("odometry to pose, all else saturated, p99", float(np.quantile(poses.delays, 0.99)), LATENCY, "s"),
-        Requirement("odometry without a pose", unanswered(poses), 0),
-        Requirement("fast laser: scans without a pose", len(scans.asked) - len(scans.delays), 0),
+        Requirement("odometry without a pose", count_unanswered(poses), 0),
+        Requirement("fast laser: scans without a pose", len(scans.sent) - len(scans.delays), 0),
         Requirement("fast laser: delay at the end", float(scans.delays[-20:].mean()), BEHIND, "s"),
     ]
     rows = [_row("odometry to pose, saturated", poses.delays), _row("scan to pose, fast laser", scans.delays)]
     report.body.append(table(["", "messages", "median [ms]", "p99 [ms]", "largest [ms]"], rows))
-    with opened(settings.logs_or(WITH_RELATIONS)) as logs:
-        replays = {log.name: replayed(str(log.path)) for log in logs}
+    with open_logs(settings.logs_or(WITH_RELATIONS)) as logs:
+        replays = {log.name: replay_log(str(log.path)) for log in logs}
     for name, replay in replays.items():
-        asked.append(Requirement(f"{name}: scans lost", replay.scans - replay.placed, 0))
-        asked.append(Requirement(f"{name}: time / that of the log at {RATE:g} times", replay.late, LATER))
-    report.requirements += asked
+        requirements.append(Requirement(f"{name}: scans lost", replay.scans - replay.answered_scans, 0))
+        requirements.append(Requirement(f"{name}: time / that of the log at {RATE:g} times", replay.time_ratio, LATER))
+    report.requirements += requirements
     report.body += [_replay_table(replays), POLICY]
     report.data = {
         "saturated": poses.delays.tolist(),
@@ -109,77 +108,80 @@ def measure_live(settings: Settings) -> Report:
     return report
 
 
-def saturated(log: str, seconds: float) -> Passed:
-    """From odometry to pose, while the machine is busy otherwise."""
-    with _running() as listener, _burning():
-        asked = _moments(listener, Odometry, ODOM, topics.SENSOR)
-        answered = _moments(listener, PoseWithCovarianceStamped, POSE, topics.STREAM)
-        _drive(listener, log, seconds, ODOM)
-        return Passed(asked, answered)
+def measure_saturated(log: str, seconds: float) -> MessageTimes:
+    """Times of odometry and poses, while all cores are busy."""
+    with _run_nodes() as listener, _saturate_cores():
+        sent = _collect_times(listener, Odometry, ODOM, topics.SENSOR)
+        received = _collect_times(listener, PoseWithCovarianceStamped, POSE, topics.STREAM)
+        _play_log(listener, log, seconds, ODOM)
+        return MessageTimes(sent, received)
 
 
-def fast(log: str, seconds: float) -> Passed:
-    """From scan to estimate."""
-    with _running() as listener:
-        asked = _moments(listener, LaserScan, SCAN, topics.SENSOR)
-        answered: Stamped = {}
+def measure_fast(log: str, seconds: float) -> MessageTimes:
+    """Times of scans and estimates, with a fast laser."""
+    with _run_nodes() as listener:
+        sent = _collect_times(listener, LaserScan, SCAN, topics.SENSOR)
+        received: Stamped = {}
 
-        def hear(message: String, info: dict[str, int]) -> None:
+        def add_estimate(message: String, info: dict[str, int]) -> None:
             estimate = decode(message.data, LocalEstimate)
-            answered[estimate.stamp] = 1e-9 * info["source_timestamp"]
+            received[estimate.stamp] = 1e-9 * info["source_timestamp"]
 
-        listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], hear, topics.CHAIN)
-        _drive(listener, log, seconds, SCAN)
-        listener.until(lambda: len(answered) >= len(asked))
-        return Passed(asked, answered)
+        listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], add_estimate, topics.CHAIN)
+        _play_log(listener, log, seconds, SCAN)
+        listener.wait_until(lambda: len(received) >= len(sent))
+        return MessageTimes(sent, received)
 
 
-class Replay(NamedTuple):
-    """What came of a replay.
+class ReplayScores(NamedTuple):
+    """The scores of a replay.
 
     :ivar scans: of the log.
-    :ivar placed: those that were given a pose.
-    :ivar late: its time, of that which it has at this rate.
+    :ivar answered_scans: number of scans with a pose.
+    :ivar time_ratio: ratio of its time to that of the log at this rate.
     """
 
     scans: int
-    placed: int
-    late: float
+    answered_scans: int
+    time_ratio: float
 
 
-def replayed(log: str) -> Replay:
-    """A log at ten times real time."""
+def replay_log(log: str) -> ReplayScores:
+    """Replay a log at ten times real time."""
     duration = open_log(log).duration / RATE
-    with _running() as listener:
-        placed = _counted(listener, DOCUMENTS[LocalEstimate])
+    with _run_nodes() as listener:
+        answered_scans = _count_documents(listener, DOCUMENTS[LocalEstimate])
         begin = time.monotonic()
-        status = _drive(listener, log, 0.0, rate=RATE, paced=True)
+        status = _play_log(listener, log, 0.0, rate=RATE, flow_control=True)
         seconds = time.monotonic() - begin
-        listener.until(lambda: placed() >= status.scans)
-        return Replay(status.scans, placed(), seconds / duration)
+        listener.wait_until(lambda: answered_scans() >= status.scans)
+        return ReplayScores(status.scans, answered_scans(), seconds / duration)
 
 
-def unanswered(passed: Passed) -> int:
-    """Messages without an answer since the first one that had one."""
-    first = min(passed.answered)
-    return sum(stamp not in passed.answered for stamp in passed.asked if stamp >= first)
+def count_unanswered(passed: MessageTimes) -> int:
+    """Number of messages without an answer since the first answered one."""
+    first = min(passed.received)
+    return sum(stamp not in passed.received for stamp in passed.sent if stamp >= first)
 
 
-def _counted(listener: Listener, topic: str) -> Callable[[], int]:
-    """How many documents of a topic there were."""
-    heard: list[None] = []
-    listener.node.create_subscription(String, topic, lambda _message: heard.append(None), topics.CHAIN)
-    return lambda: len(heard)
+def _count_documents(listener: Listener, topic: str) -> Callable[[], int]:
+    """A function that returns the number of documents of a topic since now."""
+    documents: list[None] = []
+    listener.node.create_subscription(String, topic, lambda _message: documents.append(None), topics.CHAIN)
+    return lambda: len(documents)
 
 
-def _replay_table(replays: dict[str, Replay]) -> str:
+def _replay_table(replays: dict[str, ReplayScores]) -> str:
     head = ["log", "scans", "with a pose", f"time / that of the log at {RATE:g} times"]
-    return table(head, [[name, str(own.scans), str(own.placed), f"{own.late:.2f}"] for name, own in replays.items()])
+    return table(
+        head,
+        [[name, str(own.scans), str(own.answered_scans), f"{own.time_ratio:.2f}"] for name, own in replays.items()],
+    )
 
 
 @contextmanager
-def _running() -> Iterator[Listener]:
-    """A listener, beside which all five nodes run."""
+def _run_nodes() -> Iterator[Listener]:
+    """All five nodes as processes, with a listener."""
     with ExitStack() as stack:
         listener = stack.enter_context(Listener())
         for name in PROCESSES:
@@ -188,8 +190,8 @@ def _running() -> Iterator[Listener]:
 
 
 @contextmanager
-def _burning() -> Iterator[None]:
-    """As many processes as there are cores that do nothing but compute."""
+def _saturate_cores() -> Iterator[None]:
+    """A computing process for every core."""
     burners = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
     try:
         yield
@@ -199,13 +201,19 @@ def _burning() -> Iterator[None]:
             burner.wait()
 
 
-def _drive(
-    listener: Listener, log: str, seconds: float, heard: str = "", rate: float = 1.0, *, paced: bool = False
+def _play_log(
+    listener: Listener,
+    log: str,
+    seconds: float,
+    monitored_topic: str = "",
+    rate: float = 1.0,
+    *,
+    flow_control: bool = False,
 ) -> RobotStatus:
-    """A robot that plays a log to its end; what it said then.
+    """Play a log to its end by the robot node; return the last status.
 
     :param seconds: of the log that are played; 0 for all.
-    :param heard: the robot's topic that the listener hears too.
+    :param monitored_topic: the robot's topic that the listener has subscribed to.
     """
     statuses: list[RobotStatus] = []
     listener.node.create_subscription(
@@ -215,25 +223,25 @@ def _drive(
         "log": log,
         "robot.duration": seconds,
         "robot.rate": rate,
-        "robot.flow_control": str(paced).lower(),
-        "robot.scan_listeners": 1 + (heard == SCAN),
-        "robot.odometry_listeners": 2 + (heard == ODOM),
+        "robot.flow_control": str(flow_control).lower(),
+        "robot.scan_listeners": 1 + (monitored_topic == SCAN),
+        "robot.odometry_listeners": 2 + (monitored_topic == ODOM),
         "robot.discovery_timeout": 120.0,
     }
     with listener.running("robot", parameters):
-        listener.until(lambda: bool(statuses) and statuses[-1].state == "ended", _PATIENCE)
+        listener.wait_until(lambda: bool(statuses) and statuses[-1].state == "ended", _TIMEOUT)
     return statuses[-1]
 
 
-def _moments(listener: Listener, kind: type, topic: str, profile: QoSProfile) -> Stamped:
-    """Filled with when messages were published, by the stamps in their headers."""
-    moments: Stamped = {}
+def _collect_times(listener: Listener, kind: type, topic: str, profile: QoSProfile) -> Stamped:
+    """A dictionary that collects {stamp of a message: time at which it was published, s}."""
+    times: Stamped = {}
 
-    def hear(message: Odometry, info: dict[str, int]) -> None:
-        moments[stamp_from_time(message.header.stamp)] = 1e-9 * info["source_timestamp"]
+    def add_time(message: Odometry, info: dict[str, int]) -> None:
+        times[stamp_from_time(message.header.stamp)] = 1e-9 * info["source_timestamp"]
 
-    listener.node.create_subscription(kind, topic, hear, profile)
-    return moments
+    listener.node.create_subscription(kind, topic, add_time, profile)
+    return times
 
 
 def _row(name: str, delays: NDArray[np.float64]) -> list[str]:

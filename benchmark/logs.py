@@ -1,4 +1,4 @@
-"""Logs that are measured on, decompressed where needed."""
+"""Recorded logs for measurements, decompressed where needed."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WITH_RELATIONS = tuple(name for name, (_, relations) in _FILES.items() if relati
 
 @dataclass(frozen=True)
 class MeasuredLog:
-    """A log, and what is known about it; two of the same name are equal, wherever they were decompressed to.
+    """A log with its truth; two of the same name are equal, wherever they were decompressed.
 
     :ivar name: one of ``LOGS``.
     :ivar path: of the log, as ``hmt_slam map`` takes it.
@@ -61,44 +61,44 @@ class MeasuredLog:
         return [r.measurement for r in open_log(self.path).records() if isinstance(r.measurement, Scan)]
 
 
-def datasets() -> Path:
+def dataset_folder() -> Path:
     """The folder of the data sets."""
     return Path(os.environ.get(VARIABLE) or ROOT.parent / "shared" / "datasets")
 
 
-def missing(name: str) -> str:
-    """Why a log cannot be had, as a sentence; empty where it can.
+def reason_missing(name: str) -> str:
+    """The reason for which a log is missing, as a sentence; empty for one that is there.
 
     :param name: one of ``LOGS``.
     """
-    absent = [file for file in _FILES.get(name, ()) if file and not (datasets() / file).is_file()]
-    return f"{absent[0]} is not in {datasets()}: set {VARIABLE} to the folder of the data sets" if absent else ""
+    absent = [file for file in _FILES.get(name, ()) if file and not (dataset_folder() / file).is_file()]
+    return f"{absent[0]} is not in {dataset_folder()}: set {VARIABLE} to the folder of the data sets" if absent else ""
 
 
 @contextmanager
-def opened(names: Sequence[str]) -> Iterator[list[MeasuredLog]]:
-    """The logs of some names, decompressed into a folder that vanishes at the end.
+def open_logs(names: Sequence[str]) -> Iterator[list[MeasuredLog]]:
+    """The logs of some names, decompressed into a temporary folder.
 
-    :raises HmtSlamError: for a name that is none, or a file that is not there.
+    :raises HmtSlamError: for an unknown name or a missing file.
     """
     for name in names:
         if name not in LOGS:
             raise HmtSlamError(f"there is no log {name!r}: choose from {', '.join(LOGS)}")
-        if reason := missing(name):
+        if reason := reason_missing(name):
             raise HmtSlamError(reason)
     with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder:
-        yield [_opened(name, Path(folder)) for name in names]
+        yield [_prepare_log(name, Path(folder)) for name in names]
 
 
-def _opened(name: str, folder: Path) -> MeasuredLog:
+def _prepare_log(name: str, folder: Path) -> MeasuredLog:
     if name == BUNDLED:
         return MeasuredLog(name, ROOT / "data" / "malaga_one_loop")
     log, relations = _FILES[name]
-    return MeasuredLog(name, _decompressed(log, folder), _decompressed(relations, folder) if relations else None)
+    return MeasuredLog(name, _decompress(log, folder), _decompress(relations, folder) if relations else None)
 
 
-def _decompressed(file: str, folder: Path) -> Path:
+def _decompress(file: str, folder: Path) -> Path:
     plain = folder / file.removesuffix(".xz")
-    with lzma.open(datasets() / file) as source, plain.open("wb") as target:
+    with lzma.open(dataset_folder() / file) as source, plain.open("wb") as target:
         shutil.copyfileobj(source, target)
     return plain

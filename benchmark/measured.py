@@ -1,9 +1,9 @@
-"""Run a program and tell what it cost: ``python -m benchmark.measured PROGRAM ARGUMENTS``.
+"""Run a program and print its cost: ``python -m benchmark.measured PROGRAM ARGUMENTS``.
 
-The last line of standard output is a JSON object; all that the program says goes to standard error.
+The last line of standard output is a JSON object; the output of the program goes to standard error.
 
-Why in a process of its own: to Linux, the largest resident memory of a program is at least that of the process that
-started it. This one imports nothing that is large.
+It is a separate process, because Linux gives a program at least the peak memory of the process that started it. This
+one imports nothing large.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import time
 _PR_SET_PDEATHSIG = 1
 
 
-def measured(command: list[str]) -> dict[str, float]:
+def measure_cost(command: list[str]) -> dict[str, float]:
     """Exit status, CPU seconds (user and system, with all children), wall seconds and largest resident bytes."""
     begin = time.monotonic()
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=sys.stderr)
     signal.signal(signal.SIGTERM, lambda *_: process.terminate())
     if sys.platform == "linux":
-        # Whoever started this may die without a word; then the program ends too.
+        # The program ends with the process that started this one, even if that is killed.
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
@@ -39,4 +39,4 @@ def measured(command: list[str]) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(measured(sys.argv[1:])))
+    print(json.dumps(measure_cost(sys.argv[1:])))

@@ -1,4 +1,4 @@
-"""Several visits of a building as one drive of a robot that stays there."""
+"""Several visits of a building, joined to one drive of a robot that stays there."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from hmt_slam_ros.simulation import SimulatedLog
 _PAUSE = 2 * NANOSECONDS
 
 
-class OneDrive:
-    """Visits of a robot that stays where it is in between, and turns to where it begins.
+class JoinedVisits:
+    """A log of several visits, between which the robot stays and turns to the next start.
 
     :ivar name: of the first visit.
     :ivar scan_count: of all.
@@ -33,7 +33,7 @@ class OneDrive:
         self.duration = sum(log.duration for log in visits)
 
     def records(self) -> Iterator[LogRecord]:
-        """Those of all visits on one clock, the odometry without a jump."""
+        """The records of all visits on one clock, with continuous odometry."""
         stamp, odometry = 0, np.zeros(3)
         truth: NDArray[np.float64] | None = None
         for log in self._visits:

@@ -50,37 +50,37 @@ HYPOTHESES = (1, 2, 4, 8, 16, 32)
 SEEDS, VISITS = 2, 8
 
 LIMIT = 0.05
-"""Largest mean distance at the number of hypotheses of the parameter file."""
+"""Largest mean distance with the number of hypotheses of the parameter file."""
 
 _KEYFRAMES = 6  # of a visit
 _EQUAL = 1e-6  # distances that differ by less are the same
 
 POLICY = (
     f"Drives of {VISITS} area visits, each of {_KEYFRAMES} keyframes at equal distances along the whole route; between "
-    "keyframes dead reckoning errs by 2 cm and half a degree, times the noise. Nothing is accepted on the way, and "
-    "known ground is looked for at cuts only (tsbi.recheck_keyframes is out of reach). The enumeration compares the "
-    "keyframes with every known area that the arcs do not rule out altogether, looks for ways to fit in all but 1e-9 "
-    "of the prior, and follows all of them down to a probability of 1e-9. Shared with TSBI are the transition model, "
-    "the likelihoods, and what a choice does to the map. Total variation distance of the distributions over the areas "
-    "of all visits so far, after every cut from the first one on at which a known area was possible; what TSBI did not "
-    "examine or dropped counts as wrong. Where scans tell little (tsbi.temper 0.03), many topologies stay alive and "
-    "the reduction has to choose. With odometry that errs by 8 cm and 2 degrees in 1 to 3 m nothing is required: "
-    "corridors that are alike fit so well that the enumeration believes in poses five deviations off, which the gate "
-    "on the prior (tsbi.gate_probability) keeps out on purpose, and topologies of 1e-9 come back."
+    "keyframes dead reckoning errs by 2 cm and half a degree, times the noise. No hypothesis is accepted, and "
+    "candidates in known ground are searched at cuts only (tsbi.recheck_keyframes is out of reach). The enumeration "
+    "compares the keyframes with every known area that the arcs do not exclude, searches modes in all but 1e-9 of the "
+    "prior, and keeps all of them down to a probability of 1e-9. It shares with TSBI the transition model, the "
+    "likelihoods, and the changes of the map. The figure is the total variation distance of the distributions over the "
+    "areas of all visits, after every cut from the first one on at which a known area was possible. Unexamined and "
+    "dropped hypotheses of TSBI count as wrong. With uninformative scans (tsbi.temper 0.03), many topologies stay "
+    "alive and the reduction has to choose. With odometry that errs by 8 cm and 2 degrees in 1 to 3 m there are no "
+    "requirements: similar corridors fit so well that the enumeration keeps poses five deviations off. The gate on the "
+    "prior (tsbi.gate_probability) excludes these on purpose, and topologies of 1e-9 become probable again."
 )
 
 Visits = tuple[int, ...]
-"""The area of every visit, named by the visit in which it was entered first."""
+"""The area of every visit, named by its first visit."""
 
 NEGLIGIBLE = 1e-9
-"""Probability below which a topology is not followed any further."""
+"""Probability below which a topology is dropped."""
 
 _EVERYWHERE = 1.0 - 1e-9  # share of the prior in which poses are searched for
 _DPI = 110
 
 
 class Regime(NamedTuple):
-    """Under what is compared.
+    """The conditions of a comparison.
 
     :ivar name: for the tables.
     :ivar worlds: names of ``WORLDS``.
@@ -98,12 +98,12 @@ class Regime(NamedTuple):
 
 REGIMES = (
     Regime("as it is", tuple(WORLDS), (1.0, 2.0, 3.0)),
-    Regime("scans tell little", ("ring", "four crossings", "nine crossings"), (2.0, 4.0), ("tsbi.temper=0.03",)),
+    Regime("uninformative scans", ("ring", "four crossings", "nine crossings"), (2.0, 4.0), ("tsbi.temper=0.03",)),
     Regime("odometry beyond use", tuple(WORLDS), (4.0,), required=False),
 )
 
 
-class Stop(NamedTuple):
+class KeyframeStop(NamedTuple):
     """A keyframe event of a drive.
 
     :ivar step: the motion since the last one as the odometry has it, shape (3,).
@@ -116,32 +116,32 @@ class Stop(NamedTuple):
     cut: int
 
 
-class Drive(NamedTuple):
-    """What came of one drive.
+class ComparedDrive(NamedTuple):
+    """The scores of one drive.
 
-    :ivar regime: under what, its name.
-    :ivar world: where, its name.
+    :ivar regime: name of the regime.
+    :ivar world: name of the world.
     :ivar distances: {number of hypotheses: total variation distance after every cut that counts}.
-    :ivar topologies: how many the enumeration followed at most.
-    :ivar lost: probability that it did not follow, at most.
+    :ivar topologies: largest number of topologies of the enumeration.
+    :ivar dropped: upper bound of the probability that it dropped.
     """
 
     regime: str
     world: str
     distances: dict[int, list[float]]
     topologies: int
-    lost: float
+    dropped: float
 
 
 def measure_oracle(settings: Settings) -> Report:
     """Enumerate and compare."""
     seeds = settings.seeds_or(SEEDS)
     report = Report("oracle", "TSBI against exact enumeration", seeds=seeds)
-    usual = load_configuration(PARAMETERS, list(settings.changes)).tsbi.max_hypotheses
+    usual = settings.configuration.tsbi.max_hypotheses
     rows, pictured = [], {}
     for regime in REGIMES:
         drives = [
-            compared(regime, world, seed, noise, settings.changes)
+            compare_drive(regime, world, seed, noise, settings.changes)
             for world in regime.worlds
             for noise in regime.noises
             for seed in seeds
@@ -149,8 +149,8 @@ def measure_oracle(settings: Settings) -> Report:
         means = pictured[regime.name] = mean_distances(drives)
         if regime.required:
             report.requirements += oracle_requirements(regime.name, means, usual)
-        rows += [_row(regime.name, world, [d for d in drives if d.world == world]) for world in regime.worlds]
-        rows.append(_row(regime.name, "all", drives))
+        rows += [_table_row(regime.name, world, [d for d in drives if d.world == world]) for world in regime.worlds]
+        rows.append(_table_row(regime.name, "all", drives))
         report.data[regime.name] = [drive._asdict() for drive in drives]
     head = ["scans and odometry", "world", "drives", "cuts", "topologies at most", *(f"N = {n}" for n in HYPOTHESES)]
     report.body += [table(head, rows), POLICY]
@@ -159,7 +159,7 @@ def measure_oracle(settings: Settings) -> Report:
     return report
 
 
-def stops(world: str, seed: int, noise: float) -> list[Stop]:
+def drive_stops(world: str, seed: int, noise: float) -> list[KeyframeStop]:
     """A drive along the whole route of a simulated world.
 
     :param noise: factor on the deviations of the odometry.
@@ -172,7 +172,7 @@ def stops(world: str, seed: int, noise: float) -> list[Stop]:
     errors = se2.exp(noise * random.multivariate_normal(np.zeros(3), STEP, size=len(at)))
     steps = [np.zeros(3), *(se2.between(poses[a], poses[b]) for a, b in pairwise(at))]
     return [
-        Stop(
+        KeyframeStop(
             se2.compose(step, error) if k else step,
             log.scenario.scan(int(at[k])),
             _KEYFRAMES if k >= _KEYFRAMES and k % _KEYFRAMES == _KEYFRAMES - 1 else 0,
@@ -181,69 +181,69 @@ def stops(world: str, seed: int, noise: float) -> list[Stop]:
     ]
 
 
-def compared(regime: Regime, world: str, seed: int, noise: float, changes: Sequence[str]) -> Drive:
+def compare_drive(regime: Regime, world: str, seed: int, noise: float, changes: Sequence[str]) -> ComparedDrive:
     """Enumerate a drive, and run TSBI on it with every number of hypotheses.
 
     :param changes: parameters that differ from the file, beside those of the regime.
     """
     changes = (*regime.changes, *changes)
-    drive = stops(f"sim:{WORLDS[world]},seed={seed}", seed, noise)
+    drive = drive_stops(f"sim:{WORLDS[world]},seed={seed}", seed, noise)
     enumeration = Enumeration(_configuration(changes), noise)
-    exact, counts, most = [], [], 1
+    exact, counts, most_topologies = [], [], 1
     for stop in drive:
         pmf = enumeration.keyframe(*stop)
         if stop.cut:
             exact.append(pmf)
-            counts.append(enumeration.asked)
-            most = max(most, enumeration.followed)
+            counts.append(enumeration.has_candidates)
+            most_topologies = max(most_topologies, enumeration.topology_count)
     distances = {}
     for hypotheses in HYPOTHESES:
-        found = filtered(drive, _configuration((*changes, f"tsbi.max_hypotheses={hypotheses}")), noise)
+        pmfs = run_tsbi(drive, _configuration((*changes, f"tsbi.max_hypotheses={hypotheses}")), noise)
         distances[hypotheses] = [
-            total_variation(p, q) for p, q, asked in zip(exact, found, counts, strict=True) if asked
+            total_variation(p, q) for p, q, is_counted in zip(exact, pmfs, counts, strict=True) if is_counted
         ]
-    return Drive(regime.name, world, distances, most, enumeration.lost)
+    return ComparedDrive(regime.name, world, distances, most_topologies, enumeration.dropped)
 
 
 def _configuration(changes: Sequence[str]) -> Configuration:
     return load_configuration(PARAMETERS, ["tsbi.recheck_keyframes=1000", *changes])
 
 
-def filtered(drive: Sequence[Stop], configuration: Configuration, noise: float) -> list[dict[Visits, float]]:
-    """TSBI's PMF after every cut; the sum lacks what it did not examine or dropped."""
+def run_tsbi(drive: Sequence[KeyframeStop], configuration: Configuration, noise: float) -> list[dict[Visits, float]]:
+    """TSBI's PMF after every cut, without unexamined and dropped probability."""
     script = Script(Tsbi(configuration), noise=noise)
     paths: dict[int, tuple[Visits, dict[int, int]]] = {FIRST_HYPOTHESIS: ((0,), {0: 0})}
-    found = []
+    pmfs = []
     for stop in drive:
-        leaves = script.keyframe(*stop).hypotheses
+        hypotheses = script.keyframe(*stop).hypotheses
         before, paths = paths, {}
         pmf: dict[Visits, float] = defaultdict(float)
-        for leaf in leaves:
-            path, named = before[leaf.parent]
+        for hypothesis in hypotheses:
+            path, named = before[hypothesis.parent]
             if stop.cut:
-                named = {leaf.area: len(path), **named}
-                path = (*path, named[leaf.area])
-            paths[leaf.id] = path, named
-            pmf[path] += leaf.probability
+                named = {hypothesis.area: len(path), **named}
+                path = (*path, named[hypothesis.area])
+            paths[hypothesis.id] = path, named
+            pmf[path] += hypothesis.probability
         if stop.cut:
-            found.append(dict(pmf))
-    return found
+            pmfs.append(dict(pmf))
+    return pmfs
 
 
 def total_variation(exact: Mapping[Visits, float], found: Mapping[Visits, float]) -> float:
-    """Total variation distance; what ``found`` lacks to 1 counts as probability of something else."""
+    """Total variation distance; what ``found`` lacks to 1 counts as another path."""
     lacking = max(0.0, 1.0 - sum(found.values()))
     return 0.5 * (lacking + sum(abs(exact.get(path, 0.0) - found.get(path, 0.0)) for path in {**exact, **found}))
 
 
-def mean_distances(drives: Sequence[Drive]) -> dict[int, float]:
-    """{number of hypotheses: mean distance over all cuts that count}, NaN where there are none."""
+def mean_distances(drives: Sequence[ComparedDrive]) -> dict[int, float]:
+    """{number of hypotheses: mean distance over all cuts that count}, NaN if there are none."""
     pooled = {n: [distance for drive in drives for distance in drive.distances[n]] for n in HYPOTHESES}
     return {n: float(np.mean(own)) if own else float("nan") for n, own in pooled.items()}
 
 
 def oracle_requirements(regime: str, means: Mapping[int, float], usual: int) -> list[Requirement]:
-    """That the distance is small, and that it falls with the number of hypotheses.
+    """Requirements on the distance, and on its decrease with the number of hypotheses.
 
     :param usual: number of hypotheses of the parameter file.
     """
@@ -254,7 +254,7 @@ def oracle_requirements(regime: str, means: Mapping[int, float], usual: int) -> 
     ]
 
 
-def _row(regime: str, world: str, drives: Sequence[Drive]) -> list[str]:
+def _table_row(regime: str, world: str, drives: Sequence[ComparedDrive]) -> list[str]:
     cuts = sum(len(drive.distances[HYPOTHESES[0]]) for drive in drives)
     most = max(drive.topologies for drive in drives)
     means = [f"{mean:.4f}" for mean in mean_distances(drives).values()]
@@ -262,7 +262,7 @@ def _row(regime: str, world: str, drives: Sequence[Drive]) -> list[str]:
 
 
 class _EverywhereSearch(ClosureSearch):
-    """Compares with all areas, by the same likelihoods."""
+    """A closure search in all areas, with the same likelihoods."""
 
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
         super().__init__(configuration, scans)
@@ -273,23 +273,23 @@ class _EverywhereSearch(ClosureSearch):
         hybrid_map: HybridMap,
         area: int,
         query: Query,
-        compared: Mapping[int, Collection[int]],
+        compare_drive: Mapping[int, Collection[int]],
         excluded: Collection[int],
         most: int,
         only: Collection[int] = (),
     ) -> AreaComparison:
-        """As in the model, over all areas, however many they are."""
+        """Compare as ``ClosureSearch`` does, with all areas."""
         del most, only
         options = self._options
-        fresh = {
-            known: {k: pose for k, pose in query.poses.items() if k not in compared.get(known, ())}
+        unmatched = {
+            known: {k: pose for k, pose in query.poses.items() if k not in compare_drive.get(known, ())}
             for known in hybrid_map.area_ids()
             if known not in excluded
         }
         beliefs = shortest_path_beliefs(hybrid_map, area)
-        asked = [known for known, own in fresh.items() if 2 * len(own) >= len(query.poses)]
-        priors = {known: self.gating.prior(beliefs[known], query) for known in asked}
-        candidates = {known: AreaCandidate(prior, fresh[known], 1.0) for known, prior in priors.items()}
+        candidates_by_prior = [known for known, own in unmatched.items() if 2 * len(own) >= len(query.poses)]
+        priors = {known: self.gating.prior(beliefs[known], query) for known in candidates_by_prior}
+        candidates = {known: AreaCandidate(prior, unmatched[known], 1.0) for known, prior in priors.items()}
         places = {known: self._grid_cache.place(hybrid_map, known, excluded) for known in candidates}
         entries = {known: self._entry_probability(place, candidates[known]) for known, place in places.items()}
         shares = {known: found.probability for known, found in entries.items() if found.probability}
@@ -311,38 +311,38 @@ class _EverywhereSearch(ClosureSearch):
                 (1.0 - new) * share / total,
             )
         ]
-        beside = tuple(known for known, found in modes.items() if found is None)
-        examined = tuple(known for known in shares if known not in beside)
-        return AreaComparison(Transition({}, new), tuple(fits), examined, beside, 0.0)
+        beside_areas = tuple(known for known, found in modes.items() if found is None)
+        examined = tuple(known for known in shares if known not in beside_areas)
+        return AreaComparison(Transition({}, new), tuple(fits), examined, beside_areas, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class _Topology:
-    """One way in which it may have been.
+    """A topology of the enumeration, with its map.
 
     :ivar path: its areas by visits.
-    :ivar named: {area: the visit in which it was entered first}.
+    :ivar named: {area: its first visit}.
     :ivar log_weight: log of its probability.
     """
 
     path: Visits
     named: dict[int, int]
     hybrid_map: HybridMap
-    notes: HypothesisState
+    state: HypothesisState
     robot: Robot
     log_weight: float
 
     @property
     def parent(self) -> Parent:
-        """The hypothesis that it is at the next event."""
-        return Parent(FIRST_HYPOTHESIS, self.robot.area, self.hybrid_map, self.notes, self.log_weight)
+        """The parent hypothesis of the next event."""
+        return Parent(FIRST_HYPOTHESIS, self.robot.area, self.hybrid_map, self.state, self.log_weight)
 
 
 class Enumeration:
     """All topologies of a drive.
 
-    :ivar lost: probability of the topologies that were not followed any further, at most.
-    :ivar asked: whether there was a known area so far that the robot could be in, by the arcs.
+    :ivar dropped: upper bound of the probability of the dropped topologies.
+    :ivar has_candidates: whether any known area was possible so far, by the arcs.
     """
 
     def __init__(self, configuration: Configuration, noise: float = 1.0) -> None:
@@ -353,71 +353,71 @@ class Enumeration:
         self._branching.search = _EverywhereSearch(configuration, self._replica.scans)
         self._topologies = [_Topology((0,), {0: 0}, HybridMap(), HypothesisState(), Robot(), 0.0)]
         self._sequence = -1
-        self.lost = 0.0
-        self.asked = False
+        self.dropped = 0.0
+        self.has_candidates = False
 
     @property
-    def followed(self) -> int:
-        """How many topologies there are now."""
+    def topology_count(self) -> int:
+        """Current number of topologies."""
         return len(self._topologies)
 
     def keyframe(self, step: Float64, scan: Scan, cut: int = 0) -> dict[Visits, float]:
-        """One keyframe event, as of :meth:`benchmark.scripted.Script.keyframe`; the probability of every path."""
+        """Process a keyframe event as :meth:`benchmark.scripted.Script.keyframe`; return {path: probability}."""
         self._sequence += 1
         self._replica.scans[self._sequence] = scan
         self._branching.begin_event()
         points = self._branching.search.surface_points(scan)
-        noted = [self._recognized(self._noted(topology, step), points) for topology in self._topologies]
+        topologies = [self._reweight(self._add_keyframe(topology, step), points) for topology in self._topologies]
         if cut:
             newest = range(self._sequence + 1 - cut, self._sequence + 1)
-            noted = [child for topology in noted for child in self._children(topology, newest)]
-        self._topologies = self._normalised(noted)
+            topologies = [child for topology in topologies for child in self._children(topology, newest)]
+        self._topologies = self._normalize(topologies)
         pmf: dict[Visits, float] = defaultdict(float)
         for topology in self._topologies:
             pmf[topology.path] += math.exp(topology.log_weight)
         return dict(pmf)
 
-    def _noted(self, topology: _Topology, step: Float64) -> _Topology:
-        """After the robot stored the newest keyframe in its area."""
-        robot = topology.robot.moved(step, self._noise)
+    def _add_keyframe(self, topology: _Topology, step: Float64) -> _Topology:
+        """The topology with the newest keyframe in the robot's area."""
+        robot = topology.robot.move(step, self._noise)
         topology.hybrid_map.set_keyframe(self._sequence, robot.area, robot.pose.mean)
         return replace(
-            topology, robot=robot, notes=topology.notes.after_keyframe(self._sequence, robot.pose.covariance)
+            topology, robot=robot, state=topology.state.after_keyframe(self._sequence, robot.pose.covariance)
         )
 
-    def _recognized(self, topology: _Topology, points: Float64) -> _Topology:
-        """Weighed by what the newest scan says for the known ground that the robot is in."""
+    def _reweight(self, topology: _Topology, points: Float64) -> _Topology:
+        """The topology, reweighted by the newest scan in known ground."""
         pose = topology.robot.pose.mean
         found = self._branching.reweight_by_known_ground(topology.parent, pose, points, self._sequence)
         return replace(topology, log_weight=found.log_weight)
 
     def _children(self, topology: _Topology, newest: Sequence[int]) -> Iterator[_Topology]:
         branches = self._branching.cut(topology.parent, newest)
-        self.asked |= any(child.state.matched_keyframes for child in branches.children)
+        self.has_candidates |= any(child.state.matched_keyframes for child in branches.children)
         for child in branches.children:
-            yield self._followed(topology, child)
+            yield self._continue(topology, child)
 
-    def _followed(self, topology: _Topology, child: Child) -> _Topology:
+    def _continue(self, topology: _Topology, child: Child) -> _Topology:
         hybrid_map = topology.hybrid_map.branch()
         self._replica.apply_changes(hybrid_map, child.moved_keyframes, child.arcs)
         around = areas_around(hybrid_map, child.area, self._branching.search.submap_radius)
         local = {area: belief.mean for area, belief in around.items() if area != child.area}
         named = {child.area: len(topology.path), **topology.named}
-        robot = topology.robot.entered(child.area, child.frame_change, len(child.moved_keyframes), self._noise)
+        robot = topology.robot.enter(child.area, child.frame_change, len(child.moved_keyframes), self._noise)
         path = (*topology.path, named[child.area])
         return _Topology(path, named, hybrid_map, replace(child.state, local_area_poses=local), robot, child.log_weight)
 
-    def _normalised(self, topologies: Sequence[_Topology]) -> list[_Topology]:
+    def _normalize(self, topologies: Sequence[_Topology]) -> list[_Topology]:
         total = float(np.logaddexp.reduce([topology.log_weight for topology in topologies]))
         kept = [topology for topology in topologies if topology.log_weight - total > math.log(NEGLIGIBLE)]
-        self.lost += NEGLIGIBLE * (len(topologies) - len(kept))
+        self.dropped += NEGLIGIBLE * (len(topologies) - len(kept))
         return [replace(topology, log_weight=topology.log_weight - total) for topology in kept]
 
 
 def plot_oracle(path: Path, distances: Mapping[str, Mapping[int, float]], bound: float) -> None:
-    """Total variation distance against the number of hypotheses.
+    """Draw the total variation distance against the number of hypotheses.
 
-    :param distances: {under what: {number of hypotheses: mean distance}}.
+    :param distances: {regime: {number of hypotheses: mean distance}}.
     """
     figure = Figure(figsize=(6.0, 4.5), layout="constrained")
     axes = figure.subplots()
@@ -425,7 +425,6 @@ def plot_oracle(path: Path, distances: Mapping[str, Mapping[int, float]], bound:
         axes.plot(list(own), list(own.values()), "o-", label=name)
     axes.axhline(bound, color="black", linewidth=0.8)
     axes.set_xscale("log", base=2)
-    axes.set_xlabel("hypotheses")
-    axes.set_ylabel("mean total variation distance")
+    axes.set(xlabel="hypotheses", ylabel="mean total variation distance")
     axes.legend(fontsize=7)
     figure.savefig(path, dpi=_DPI)

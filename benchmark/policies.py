@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from benchmark.logs import LOGS, WITH_RELATIONS, MeasuredLog, opened
-from benchmark.loops import closable, missed_share
-from benchmark.report import Report, Requirement, table
+from benchmark.logs import LOGS, WITH_RELATIONS, MeasuredLog, open_logs
+from benchmark.loops import loops_to_close, missed_share
+from benchmark.report import Columns, Report, Requirement, format_share, mean, table, table_of
 from benchmark.runs import Case, Run
 from benchmark.scoring import POLICY as RELATIONS
 from benchmark.scoring import SeedMeans, over_seeds, score
@@ -19,26 +19,26 @@ from benchmark.simulated.worlds import INSTITUTE, World
 from hmt_slam_ros.errors import HmtSlamError
 
 SEEDS = 4
-"""Worlds of every family, and runs of every log where two are as many as are asked for."""
+"""Worlds of every family."""
 
 FAMILIES = ("office", "busy", INSTITUTE, "hall")
 
 POLICIES = ("ncut", "both")
 
 NEAR, PORTAL = 1.0, 0.5
-"""How far from a true opening an area may end there, and a portal be there, m."""
+"""Largest distance of a change of areas from a true opening, and of a portal, m."""
 
 _LOG_SEEDS = 2
 
-# What is asked of the policies that ask for openings: doors found, portals true, and errors relative to ncut.
+# Bounds for policies with openings: share of doors found, of true portals, of missed loops; errors relative to ncut.
 _DOORS, _TRUE, _MISSED, _WORSE = 0.9, 0.9, 0.05, 1.1
 
-TOLD = (
-    "Doors are the open doors that the path passes, crossings the places where hallways cross; both are counted once, "
-    f"and are found where the path changes areas within {NEAR:g} m of the door, or of the crossing's border. Corners "
-    "of hallways and halls have openings, too, which are no doors: so a portal is true where there is any gap between "
-    f"walls within {PORTAL:g} m, as those that landmarks have to show. Their error is from there. The pose's error is "
-    "that of RTL in the map, mean over the drive and the runs. Closures and loops as of `loops`. " + RELATIONS
+POLICY = (
+    "Doors are the open doors on the path, crossings the intersections of hallways; each counts once, and is found if "
+    f"the path changes areas within {NEAR:g} m of the door, or of the crossing's border. Corners of hallways and halls "
+    "have openings, too, which are no doors. So a portal is true if there is any gap between walls within "
+    f"{PORTAL:g} m, to which its error is measured. The error of the pose is RTL's in the map, mean over drive and "
+    "runs. Closures and loops are defined as in `loops`. " + RELATIONS
 )
 
 
@@ -52,15 +52,15 @@ def measure_policies(settings: Settings) -> Report:
     report = Report("policies", "Where areas end: at cuts, at doors, or both", seeds=seeds)
     families = [name for name in FAMILIES if name in names]
     if families:
-        records = {policy: _records(settings, policy, families, seeds) for policy in POLICIES}
+        records = {policy: _make_records(settings, policy, families, seeds) for policy in POLICIES}
         report.requirements += [r for policy in POLICIES[1:] for r in requirements(policy, records)]
         report.body.append(_table(records, families))
         report.data["doors"] = {
             policy: {record["world"]: record["doors"] for record in own} for policy, own in records.items()
         }
-    with opened([name for name in names if name in LOGS]) as logs:
+    with open_logs([name for name in names if name in LOGS]) as logs:
         _score(report, settings, logs)
-    report.body.append(TOLD)
+    report.body.append(POLICY)
     return report
 
 
@@ -68,82 +68,86 @@ def _changes(settings: Settings, policy: str) -> tuple[str, ...]:
     return (*settings.changes, f"aam.area_policy={policy}")
 
 
-def _records(settings: Settings, policy: str, families: Sequence[str], seeds: Sequence[int]) -> list[Record]:
+def _make_records(settings: Settings, policy: str, families: Sequence[str], seeds: Sequence[int]) -> list[Record]:
     records = Records(settings.records.folder / policy, settings.records.jobs)
-    return records.of([World(family, seed) for family in families for seed in seeds], _changes(settings, policy))
+    return records.make([World(family, seed) for family in families for seed in seeds], _changes(settings, policy))
 
 
 def requirements(policy: str, records: Mapping[str, Sequence[Record]]) -> list[Requirement]:
-    """What is asked of a policy.
+    """Requirements on a policy.
 
-    :param records: of this one and of ncut.
+    :param records: of this policy and of ncut.
     """
     own = records[policy]
     return [
-        Requirement(f"{policy}: doors at which areas end", share(own, "doors", NEAR), 1.0, least=_DOORS),
-        Requirement(f"{policy}: portals that are true", share(own, "portals", PORTAL), 1.0, least=_TRUE),
-        Requirement(f"{policy}: closures accepted falsely", _false(own), 0),
+        Requirement(f"{policy}: doors at which areas end", share_within(own, "doors", NEAR), 1.0, least=_DOORS),
+        Requirement(f"{policy}: portals that are true", share_within(own, "portals", PORTAL), 1.0, least=_TRUE),
+        Requirement(f"{policy}: closures accepted falsely", _count_false(own), 0),
         Requirement(f"{policy}: loops that could be closed and were not, share", missed_share(list(own)), _MISSED),
-        Requirement(f"{policy}: error of the pose / that by ncut", _error(own) / _error(records["ncut"]), _WORSE),
+        Requirement(
+            f"{policy}: error of the pose / that by ncut",
+            _mean_pose_error(own) / _mean_pose_error(records["ncut"]),
+            _WORSE,
+        ),
     ]
 
 
-def share(records: Sequence[Record], kind: str, within: float) -> float:
-    """Of all distances of a kind those that are within some, m; NaN where there are none."""
-    apart = _apart(records, kind)
-    return float(np.mean(apart <= within)) if apart.size else math.nan
+def share_within(records: Sequence[Record], kind: str, within: float) -> float:
+    """The share of the distances of a kind up to a limit, m; NaN if there are none."""
+    return mean(_distances(records, kind) <= within)
 
 
-def _apart(records: Sequence[Record], kind: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Distances, m; a record holds None where there is nothing."""
-    return np.array([math.inf if d is None else d for record in records for d in record["doors"][kind]])
+def _distances(records: Sequence[Record], kind: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Distances of a kind, m; inf where a record has None, for nothing in reach."""
+    return np.array(
+        [math.inf if distance is None else distance for record in records for distance in record["doors"][kind]]
+    )
 
 
-def _false(records: Sequence[Record]) -> int:
+def _count_false(records: Sequence[Record]) -> int:
     return sum(not closure["right"] for record in records for closure in record["accepted"])
 
 
-def _error(records: Sequence[Record]) -> float:
+def _mean_pose_error(records: Sequence[Record]) -> float:
     """Mean error of the pose in the map, m."""
     return float(np.mean([pose["map"]["translation"] for record in records for pose in record["poses"]]))
 
 
 def _table(records: Mapping[str, Sequence[Record]], families: Sequence[str]) -> str:
-    head = ["world", "policy", "runs", "areas", "changes of areas", "at a door or crossing", "doors", "found"]
-    head += ["crossings", "found", "portals", "true", "doors with one", "portals' error [m]", "error of the pose [m]"]
-    head += ["closures", "false", "loops", "in time"]
     rows = [
-        [family, policy, *_cells([record for record in records[policy] if record["family"] == family])]
+        (family, policy, [record for record in records[policy] if record["family"] == family])
         for family in families
         for policy in records
     ]
-    return table(head, rows)
-
-
-def _cells(records: Sequence[Record]) -> list[str]:
-    portals, loops = _apart(records, "portals"), closable(list(records))
-    right = portals[portals <= PORTAL]
-    return [
-        str(len(records)),
-        f"{np.mean([record['doors']['areas'] for record in records]):.1f}",
-        *_counted(records, "changes", NEAR),
-        *_counted(records, "doors", NEAR),
-        *_counted(records, "crossings", NEAR),
-        *_counted(records, "portals", PORTAL),
-        _counted(records, "doors_portals", PORTAL)[1],
-        f"{right.mean():.2f}" if right.size else "-",
-        f"{_error(records):.3f}",
-        str(sum(len(record["accepted"]) for record in records)),
-        str(_false(records)),
-        str(len(loops)),
-        str(sum(loop["in_time"] for loop in loops)),
+    columns: Columns[tuple[str, str, list[Record]]] = [
+        ("world", lambda row: row[0]),
+        ("policy", lambda row: row[1]),
+        ("runs", lambda row: str(len(row[2]))),
+        ("areas", lambda row: f"{mean([record['doors']['areas'] for record in row[2]]):.1f}"),
+        ("changes of areas", lambda row: str(_distances(row[2], "changes").size)),
+        ("at a door or crossing", lambda row: format_share(_distances(row[2], "changes") <= NEAR)),
+        ("doors", lambda row: str(_distances(row[2], "doors").size)),
+        ("found", lambda row: format_share(_distances(row[2], "doors") <= NEAR)),
+        ("crossings", lambda row: str(_distances(row[2], "crossings").size)),
+        ("found", lambda row: format_share(_distances(row[2], "crossings") <= NEAR)),
+        ("portals", lambda row: str(_distances(row[2], "portals").size)),
+        ("true", lambda row: format_share(_distances(row[2], "portals") <= PORTAL)),
+        ("doors with one", lambda row: format_share(_distances(row[2], "doors_portals") <= PORTAL)),
+        ("portals' error [m]", lambda row: _format_portal_error(row[2])),
+        ("error of the pose [m]", lambda row: f"{_mean_pose_error(row[2]):.3f}"),
+        ("closures", lambda row: str(sum(len(record["accepted"]) for record in row[2]))),
+        ("false", lambda row: str(_count_false(row[2]))),
+        ("loops", lambda row: str(len(loops_to_close(row[2])))),
+        ("in time", lambda row: str(sum(loop["in_time"] for loop in loops_to_close(row[2])))),
     ]
+    return table_of(columns, rows)
 
 
-def _counted(records: Sequence[Record], kind: str, within: float) -> list[str]:
-    """How many there are, and which share of them is within a distance."""
-    count = _apart(records, kind).size
-    return [str(count), f"{100.0 * share(records, kind, within):.0f} %" if count else "-"]
+def _format_portal_error(records: Sequence[Record]) -> str:
+    """The mean distance of true portals from their gaps, m; "-" if there are none."""
+    portals = _distances(records, "portals")
+    true = portals[portals <= PORTAL]
+    return f"{true.mean():.2f}" if true.size else "-"
 
 
 def _score(report: Report, settings: Settings, logs: Sequence[MeasuredLog]) -> None:

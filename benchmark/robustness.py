@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmark.degraded_odometry import KINDS
-from benchmark.logs import WITH_RELATIONS, MeasuredLog, opened
+from benchmark.logs import WITH_RELATIONS, MeasuredLog, open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import Case, Run
 from benchmark.scoring import FINAL, over_seeds, score
@@ -22,23 +22,23 @@ from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
 SEEDS = 5
 
 LONG_LIMIT = 1.0
-"""Largest error of a relation over more than 60 s in a map of the right topology, m: a missed loop leaves more."""
+"""Largest error of a relation over more than 60 s in a map of the right topology, m."""
 
 CLOSURE_LIMIT, CLOSURE_ANGLE = 0.5, 10.0
-"""Largest error of an arc that closed a loop and joins what is joined, m and degrees."""
+"""Largest error of an arc that closed a true loop, m and degrees."""
 
 POLICY = (
-    "The kinds are those of `benchmark/degraded_odometry.py`, drawn anew for every seed. A map has the right topology "
-    f"where every relation over more than 60 s is within {LONG_LIMIT:g} m of the truth, and every arc that closed a "
-    f"loop is within {CLOSURE_LIMIT:g} m and {CLOSURE_ANGLE:g} degrees of the run of the same seed with the odometry "
-    "as recorded, between the two keyframes of its areas that are nearest to each other there. Errors are means over "
-    "all seeds, also of the maps with a wrong topology; relations are matched as for accuracy."
+    "The kinds are those of `benchmark/degraded_odometry.py`, with random numbers of the run's seed. A map has the "
+    f"right topology if every relation over more than 60 s is within {LONG_LIMIT:g} m of the truth, and every arc that "
+    f"closed a loop is within {CLOSURE_LIMIT:g} m and {CLOSURE_ANGLE:g} degrees of the run of the same seed with the "
+    "recorded odometry, between the two keyframes of its areas that are nearest to each other there. Errors are means "
+    "over all seeds, including those with a wrong topology; relations are matched as for accuracy."
 )
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """On the topology of a run.
+class TopologyVerdict:
+    """The verdict on the topology of a run.
 
     :ivar scores: of the final trajectory; None for a run that failed.
     :ivar closures: errors of the arcs that closed a loop.
@@ -49,12 +49,12 @@ class Verdict:
 
     @property
     def wrong_closures(self) -> list[ClosureError]:
-        """The arcs that join what is not joined."""
+        """The arcs that closed a false loop."""
         return [c for c in self.closures if not (c.translation <= CLOSURE_LIMIT and c.rotation <= CLOSURE_ANGLE)]
 
     @property
-    def right(self) -> bool:
-        """Whether no loop was missed and none closed wrongly."""
+    def is_right(self) -> bool:
+        """Whether no loop is missed, and none is false."""
         if self.scores is None:
             return False
         return self.scores.over_60_s.translation.max <= LONG_LIMIT and not self.wrong_closures
@@ -65,41 +65,43 @@ def measure_robustness(settings: Settings) -> Report:
     seeds = settings.seeds_or(SEEDS)
     report = Report("robustness", "Accuracy with degraded odometry", seeds=seeds)
     rows: list[list[str]] = []
-    with opened(settings.logs_or(WITH_RELATIONS)) as logs:
+    with open_logs(settings.logs_or(WITH_RELATIONS)) as logs:
         for log in logs:
             references = settings.runner.runs([Case(log, seed, "", settings.changes) for seed in seeds])
             for kind in ("", *KINDS):
                 runs = settings.runner.attempts([Case(log, seed, kind, settings.changes) for seed in seeds])
-                verdicts = [verdict(run, reference) for run, reference in zip(runs, references, strict=True)]
+                verdicts = [judge_run(run, reference) for run, reference in zip(runs, references, strict=True)]
                 name = kind or "as recorded"
-                wrong = sum(not given.right for given in verdicts)
+                wrong = sum(not verdict.is_right for verdict in verdicts)
                 report.requirements.append(Requirement(f"{log.name}, {name}: seeds with a wrong topology", wrong, 0))
-                report.data[f"{log.name} {name}"] = [asdict(given) | {"right": given.right} for given in verdicts]
-                rows.append([log.name, name, *_cells(runs, verdicts)])
+                report.data[f"{log.name} {name}"] = [
+                    asdict(verdict) | {"right": verdict.is_right} for verdict in verdicts
+                ]
+                rows.append([log.name, name, *_verdict_cells(runs, verdicts)])
     head = ["log", "odometry", "translation [m]", "between seeds", "worst seed", "over 60 s [m]", "its max"]
     head += ["rotation [deg]", "areas", "loop closures", "wrong ones", "right topology"]
     report.body += [table(head, rows), POLICY]
     return report
 
 
-def verdict(run: Run, reference: Run) -> Verdict:
-    """Judge a run by the truth and by the run with the odometry as recorded."""
+def judge_run(run: Run, reference: Run) -> TopologyVerdict:
+    """The verdict on a run by the truth, and by the run with the recorded odometry."""
     if run.fault:
-        return Verdict(None)
+        return TopologyVerdict(None)
     closures = closure_errors(read_saved_map(run.folder / "hmt_map"), _true_poses(reference))
-    return Verdict(score(run.folder, run.case.log), tuple(closures))
+    return TopologyVerdict(score(run.folder, run.case.log), tuple(closures))
 
 
 def _true_poses(reference: Run) -> dict[int, NDArray[np.float64]]:
     log: MeasuredLog = reference.case.log
     poses = read_tum(reference.folder / FINAL).poses
-    # The run may have been of the beginning of the log.
+    # The run may be of the beginning of the log.
     return {scan.stamp: pose for scan, pose in zip(log.scans[: len(poses)], poses, strict=True)}
 
 
-def _cells(runs: Sequence[Run], verdicts: Sequence[Verdict]) -> list[str]:
-    scores = [given.scores for given in verdicts if given.scores is not None]
-    right = f"{sum(given.right for given in verdicts)} of {len(verdicts)}"
+def _verdict_cells(runs: Sequence[Run], verdicts: Sequence[TopologyVerdict]) -> list[str]:
+    scores = [verdict.scores for verdict in verdicts if verdict.scores is not None]
+    right = f"{sum(verdict.is_right for verdict in verdicts)} of {len(verdicts)}"
     if not scores:
         return [*["-"] * 9, right]
     mean = over_seeds(scores)
@@ -113,14 +115,14 @@ def _cells(runs: Sequence[Run], verdicts: Sequence[Verdict]) -> list[str]:
         f"{mean.rotation:.2f}",
         f"{np.mean([report['areas'] for report in reports]):.1f}",
         f"{np.mean([report['loop_closures'] for report in reports]):.1f}",
-        str(sum(len(given.wrong_closures) for given in verdicts)),
+        str(sum(len(verdict.wrong_closures) for verdict in verdicts)),
         right,
     ]
 
 
 @dataclass(frozen=True)
 class ClosureError:
-    """How far an arc that closed a loop is from the truth.
+    """The error of an arc that closed a loop.
 
     :ivar areas: that it joins.
     :ivar translation: m.
@@ -135,16 +137,18 @@ class ClosureError:
 def closure_errors(saved: SavedMap, truth: Mapping[int, NDArray[np.float64]]) -> list[ClosureError]:
     """Errors of all arcs of the most probable map that closed a loop.
 
-    An arc is judged where it matters, between the two keyframes of its areas that truly are nearest to each other.
+    The error is that between the two keyframes of its areas that truly are nearest to each other.
 
     :param truth: {running stamp of a scan, ns: ``map_T_base`` (3,)}, of all scans of the log, in any one frame.
     """
     arcs = saved.replica.maps[saved.replica.best_hypothesis].all_arcs()
-    return [_error(saved, a, b, arc, truth) for a, b, arc in arcs if arc.closure]
+    return [_closure_error(saved, a, b, arc, truth) for a, b, arc in arcs if arc.closure]
 
 
-def _error(saved: SavedMap, a: int, b: int, arc: ArcValue, truth: Mapping[int, NDArray[np.float64]]) -> ClosureError:
-    (a_T_keyframes, true_in_a), (b_T_keyframes, true_in_b) = (_keyframes(saved, area, truth) for area in (a, b))
+def _closure_error(
+    saved: SavedMap, a: int, b: int, arc: ArcValue, truth: Mapping[int, NDArray[np.float64]]
+) -> ClosureError:
+    (a_T_keyframes, true_in_a), (b_T_keyframes, true_in_b) = (_keyframe_poses(saved, area, truth) for area in (a, b))
     distances = np.hypot(*(true_in_a[:, None, :2] - true_in_b[None, :, :2]).transpose(2, 0, 1))
     k, m = np.unravel_index(np.argmin(distances), distances.shape)
     through_arc = se2.between(a_T_keyframes[k], se2.compose(arc.pose.mean, b_T_keyframes[m]))
@@ -152,10 +156,10 @@ def _error(saved: SavedMap, a: int, b: int, arc: ArcValue, truth: Mapping[int, N
     return ClosureError((a, b), float(np.hypot(error[0], error[1])), float(np.degrees(abs(error[2]))))
 
 
-def _keyframes(
+def _keyframe_poses(
     saved: SavedMap, area: int, truth: Mapping[int, NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Poses (n, 3) of an area's keyframes in the area, and in truth."""
+    """Poses (n, 3) of an area's keyframes in the area, and true ones."""
     keyframes = saved.replica.maps[saved.replica.best_hypothesis].keyframes(area)
     poses = np.array(list(keyframes.values())).reshape(-1, 3)
     return poses, np.array([truth[saved.replica.scans[keyframe].stamp] for keyframe in keyframes]).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""The nodes as processes in a domain of their own, a node that listens to them, and how long they take to start."""
+"""The nodes as OS processes in a separate domain, a node that listens to them, and their start times."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from benchmark.logs import BUNDLED, ROOT, opened
+from benchmark.logs import BUNDLED, ROOT, open_logs
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.process_table import node_command, process_names
@@ -27,13 +27,13 @@ from hmt_slam_ros.ros.domain import own_domain
 from hmt_slam_ros.ros.topics import DOCUMENTS
 
 Parameters = Mapping[str, str | float | list[float]]
-_PATIENCE = 120.0  # s
+_TIMEOUT = 120.0  # s
 _SPIN = 0.005  # s
 NODES = (*process_names(), "robot")
 
 
 class Listener:
-    """A node in a domain of its own, and the processes that it waits for.
+    """A node in a separate domain, which starts processes and waits for them.
 
     :ivar node: the node.
     """
@@ -58,21 +58,21 @@ class Listener:
     def __exit__(self, *_fault: object) -> None:
         self._stack.close()
 
-    def until(self, condition: Callable[[], bool], patience: float = _PATIENCE) -> None:
+    def wait_until(self, condition: Callable[[], bool], timeout: float = _TIMEOUT) -> None:
         """Spin until a condition holds.
 
-        :param patience: s.
-        :raises HmtSlamError: where it does not for so long.
+        :param timeout: s.
+        :raises HmtSlamError: where it does not hold in time.
         """
-        deadline = time.monotonic() + patience
+        deadline = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > deadline:
-                raise HmtSlamError(f"a node did not answer within {patience:g} s: see whether scripts/demo.sh runs")
+                raise HmtSlamError(f"a node did not answer within {timeout:g} s: see whether scripts/demo.sh runs")
             self._executor.spin_once(timeout_sec=_SPIN)
 
     @contextmanager
     def running(self, name: str, parameters: Parameters) -> Iterator[subprocess.Popen[bytes]]:
-        """A node as a process of its own, which ends with the context."""
+        """A node as an OS process, which ends with the context."""
         words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
         process = subprocess.Popen(
             [sys.executable, *node_command(name), "--ros-args", *words],
@@ -86,44 +86,44 @@ class Listener:
             yield process
         finally:
             process.send_signal(signal.SIGINT)
-            process.wait(_PATIENCE)
+            process.wait(_TIMEOUT)
 
 
-class Start(NamedTuple):
-    """What a start takes: seconds on the wall, and of CPU time, which other programs of the machine do not change."""
+class StartTime(NamedTuple):
+    """The duration of a start: wall time and CPU time, s."""
 
     wall: float
     cpu: float
 
 
-def until_answer(name: str) -> Start:
-    """From the start of a node's process until it answers a service call, as it does once it spins."""
-    with Listener() as listener, opened([BUNDLED]) as (log,):
+def time_until_answer(name: str) -> StartTime:
+    """Time from the start of a node's process until it answers a service call."""
+    with Listener() as listener, open_logs([BUNDLED]) as (log,):
         client = listener.node.create_client(ListParameters, f"{name}/list_parameters")
         begin = time.monotonic()
-        with listener.running(name, _waiting(log.path) if name == "robot" else {}) as process:
-            listener.until(client.service_is_ready)
+        with listener.running(name, _waiting_robot(log.path) if name == "robot" else {}) as process:
+            listener.wait_until(client.service_is_ready)
             answer = client.call_async(ListParameters.Request())
-            listener.until(answer.done)
-            return Start(time.monotonic() - begin, _cpu_seconds(process))
+            listener.wait_until(answer.done)
+            return StartTime(time.monotonic() - begin, _cpu_seconds(process))
 
 
-def until_first_pose() -> Start:
-    """From the start of metric SLAM until it has placed the first scan, with scans waiting for it."""
-    with Listener() as listener, opened([BUNDLED]) as (log,):
-        heard: list[String] = []
-        listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], heard.append, topics.CHAIN)
+def time_until_first_pose() -> StartTime:
+    """Time from the start of metric SLAM to the pose of the first scan, with waiting scans."""
+    with Listener() as listener, open_logs([BUNDLED]) as (log,):
+        estimates: list[String] = []
+        listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], estimates.append, topics.CHAIN)
         robot = listener.node.create_client(ListParameters, "robot/list_parameters")
-        with listener.running("robot", _waiting(log.path)):
-            listener.until(robot.service_is_ready)
+        with listener.running("robot", _waiting_robot(log.path)):
+            listener.wait_until(robot.service_is_ready)
             begin = time.monotonic()
             with listener.running("slam", {"laser_pose": log.scans[0].laser_pose.tolist()}) as process:
-                listener.until(lambda: bool(heard))
-                return Start(time.monotonic() - begin, _cpu_seconds(process))
+                listener.wait_until(lambda: bool(estimates))
+                return StartTime(time.monotonic() - begin, _cpu_seconds(process))
 
 
-def _waiting(log: Path) -> Parameters:
-    """Parameters of a robot that waits for whoever listens."""
+def _waiting_robot(log: Path) -> Parameters:
+    """Parameters of a robot that waits for its subscribers."""
     return {"log": str(log), "robot.discovery_timeout": 3600.0, "robot.rate": 0.0}
 
 

@@ -1,4 +1,4 @@
-"""Runs of ``hmt_slam map``, each in a process of its own, a few at a time."""
+"""Runs of ``hmt_slam map``, each in its own process, several in parallel."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,7 +24,7 @@ _TAIL = 3  # lines of a failed run that go into a message
 
 @dataclass(frozen=True)
 class Case:
-    """What is run.
+    """A run to be made.
 
     :ivar log: the log.
     :ivar seed: of all random numbers.
@@ -47,29 +47,31 @@ class Case:
     def name(self) -> str:
         """Of the output folder."""
         changes = "_".join(re.sub(r"[^\w.]+", "_", change) for change in self.changes)
-        part = "_".join(f"{name}_{of:g}" for name, of in (("from", self.start), ("for", self.duration)) if of)
-        return "-".join(filter(None, (self.log.name, self.kind, changes, part, str(self.seed))))
+        section = "_".join(
+            f"{name}_{seconds:g}" for name, seconds in (("from", self.start), ("for", self.duration)) if seconds
+        )
+        return "-".join(filter(None, (self.log.name, self.kind, changes, section, str(self.seed))))
 
     def command(self, folder: Path) -> list[str]:
         """The command line that maps the log into a folder."""
         program = ["benchmark.degraded_odometry", self.kind] if self.kind else ["hmt_slam_ros.cli.main", "map"]
         options = ["--out", str(folder), "--seed", str(self.seed), "--config", str(PARAMETERS)]
-        given = {"--duration": self.duration, "--start": self.start, "--from": self.source}
-        part = [word for name, value in given.items() if value for word in (name, str(value))]
+        section = {"--duration": self.duration, "--start": self.start, "--from": self.source}
+        section_words = [word for name, value in section.items() if value for word in (name, str(value))]
         changes = [word for change in self.changes for word in ("--set", change)]
-        return [sys.executable, "-m", *program, str(self.log.path), *options, *part, *changes]
+        return [sys.executable, "-m", *program, str(self.log.path), *options, *section_words, *changes]
 
 
 @dataclass(frozen=True)
 class Run:
-    """What came of a case.
+    """The outcome of a case.
 
     :ivar case: what was run.
     :ivar folder: its output folder.
     :ivar cpu_seconds: of the whole process, user and system.
     :ivar wall_seconds: likewise.
     :ivar peak_rss: likewise, bytes.
-    :ivar fault: what a failed run said last, empty for one that went well.
+    :ivar fault: last lines of the errors of a failed run, empty for a successful one.
     """
 
     case: Case
@@ -87,7 +89,7 @@ class Run:
 
 
 class Runner:
-    """Runs cases, each once, however often it is asked for.
+    """Runs cases, each at most once.
 
     :ivar folder: gets a folder for each run.
     :ivar jobs: runs at the same time.
@@ -98,7 +100,7 @@ class Runner:
         self._done: dict[Case, Run] = {}
 
     def attempts(self, cases: Sequence[Case]) -> list[Run]:
-        """The runs of some cases in their order, also of those that failed."""
+        """The runs of some cases in their order, including failed ones."""
         waiting = [case for case in dict.fromkeys(cases) if case not in self._done]
         with ThreadPoolExecutor(self.jobs) as pool:
             self._done.update(zip(waiting, pool.map(self._run, waiting), strict=True))
@@ -106,11 +108,15 @@ class Runner:
         return [replace(self._done[case], case=case) for case in cases]
 
     def runs(self, cases: Sequence[Case]) -> list[Run]:
-        """Likewise, where none may fail.
+        """The runs of some cases in their order.
 
-        :raises HmtSlamError: where one did.
+        :raises HmtSlamError: where one fails.
         """
-        return list(_successful(self.attempts(cases)))
+        runs = self.attempts(cases)
+        for run in runs:
+            if run.fault:
+                raise HmtSlamError(f"the run {run.case.name} failed: {run.fault}")
+        return runs
 
     def _run(self, case: Case) -> Run:
         run = run_case(case, self.folder.absolute() / case.name)
@@ -118,15 +124,8 @@ class Runner:
         return run
 
 
-def _successful(runs: Iterable[Run]) -> Iterable[Run]:
-    for run in runs:
-        if run.fault:
-            raise HmtSlamError(f"the run {run.case.name} failed, it said: {run.fault}")
-        yield run
-
-
 def run_case(case: Case, folder: Path) -> Run:
-    """Run a case in a process of its own."""
+    """Run a case in its own process."""
     result = subprocess.run(
         [sys.executable, "-m", "benchmark.measured", *case.command(folder)],
         cwd=ROOT,
@@ -135,9 +134,9 @@ def run_case(case: Case, folder: Path) -> Run:
         text=True,
         check=False,
     )
-    last_words = " | ".join(result.stderr.strip().splitlines()[-_TAIL:]) or "nothing"
+    last_lines = " | ".join(result.stderr.strip().splitlines()[-_TAIL:]) or "nothing"
     if result.returncode:
-        return Run(case, folder, 0.0, 0.0, 0, last_words)
+        return Run(case, folder, 0.0, 0.0, 0, last_lines)
     usage = json.loads(result.stdout.splitlines()[-1])
-    fault = last_words if usage["status"] else ""
+    fault = last_lines if usage["status"] else ""
     return Run(case, folder, usage["cpu_s"], usage["wall_s"], int(usage["peak_rss_bytes"]), fault)

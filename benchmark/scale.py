@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmark.lattice import BEAMS, OFFSETS, PER_AREA, SPACING, Lattice, LatticeScans, scan_at, shared_scan, stops
+from benchmark.lattice import BEAMS, OFFSETS, PER_AREA, SPACING, Lattice, LatticeScans, make_stops, scan_at, shared_scan
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.scale_maps import BEAMS as STORED_BEAMS
-from benchmark.scale_maps import SCANS_PER_KEYFRAME, Lasting, Stored, lasting, stored
+from benchmark.scale_maps import SCANS_PER_KEYFRAME, AreaMemory, SaveTimes, time_saving, weigh_areas
 from benchmark.scripted import STEP, Script
 from benchmark.settings import Settings
-from benchmark.simulated.examinations import Examination, WatchedBranching
+from benchmark.simulated.examinations import Examination, ObservedBranching
 from hmt_slam_ros.area_abstraction.aam import Aam
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
@@ -42,10 +42,10 @@ CUT_BOUNDS = {10_000: 100.0, 100_000: 1000.0}
 """Largest time of a cut, ms, by the number of areas."""
 
 STRESS = ("tsbi.prior_scale=5", "tsbi.temper=0.03")
-"""Changes under which arcs admit more areas than are looked at, and scans decide little."""
+"""Parameters under which arcs admit more areas than are compared, and scans are nearly uninformative."""
 
 GROWTH = 0.1
-"""Largest growth of what a scan costs in SLAM and RTL, from the smallest to the largest of the small maps."""
+"""Largest growth of the cost of a scan in SLAM and RTL, from the smallest to the largest of the small maps."""
 
 STORED = 20.0
 """Largest memory of a stored area, kB."""
@@ -59,24 +59,23 @@ SAVED_AND_LOADED = 5.0
 _FEW = 2  # excursions under stress
 
 POLICY = (
-    "Maps are lattices of corridors, all crossings alike, made as data: every crossing is an area of "
-    f"{PER_AREA} keyframes with arcs to the next ones, {BEAMS} beams to a scan. For the cuts a robot leaves the "
-    "lattice, goes along beside it for up to eight crossings with a new area at each, and comes back; its odometry "
-    "errs as its covariance says, and a stand-in for metric SLAM and acceptance hands TSBI its poses. A cut is timed "
-    "from the keyframe to the acceptance, CPU time of one process, under all hypotheses that are alive. Under stress "
-    f"({', '.join(STRESS)}) arcs admit far more areas than are looked at, which counts as not examined, and scans "
-    "decide little. For the scans all five processes run in a loop through known ground; CPU time a "
-    "scan, the median of the repetitions. Memory is what Python allocates: poses and arcs in each process that keeps "
-    f"the map, and the ranges of its scans, here of {STORED_BEAMS} beams; what can be computed anew from them is told, "
-    "and does not count. What is saved is the whole state of a run that mapped the lattice in one pass, under one "
-    f"hypothesis, with a scan of its own of {STORED_BEAMS} beams for every keyframe and {SCANS_PER_KEYFRAME} scans of "
-    "the log to each. Saving ends when all is on the disk of the system's folder for temporary files, loading with "
-    "processes that can go on; wall time."
+    f"Maps are synthetic lattices of corridors with equal crossings: every crossing is an area of {PER_AREA} keyframes "
+    f"with arcs to the next ones, {BEAMS} beams to a scan. For the cuts a robot leaves the lattice, drives beside it "
+    "for up to eight crossings with a new area at each, and returns. Its odometry errs by its covariance, and a "
+    "replacement of metric SLAM and acceptance gives its poses to TSBI. The time of a cut is that from the keyframe to "
+    f"the acceptance, CPU time of one process, under all live hypotheses. Under stress ({', '.join(STRESS)}) arcs "
+    "admit far more areas than are compared, which counts as unexamined, and scans are nearly uninformative. For the "
+    "scans all five processes run in a loop through known ground; CPU time of a scan, median of the repetitions. "
+    "Memory is what Python allocates: poses and arcs in each process that keeps the map, and the ranges of its scans, "
+    f"here of {STORED_BEAMS} beams. Data that can be computed from these is listed, and does not count. The saved "
+    f"state is that of a run that mapped the lattice in one pass, under one hypothesis, with a scan of {STORED_BEAMS} "
+    f"beams for every keyframe and {SCANS_PER_KEYFRAME} scans of the log to each. Saving ends with all files on the "
+    "disk of the system's temporary folder, loading with processes that can continue; wall time."
 )
 
 _EXCURSIONS = 6
 _LONGEST = 8  # crossings along the map
-_SMALL = 1000  # maps of at most so many areas are made anew for every excursion
+_SMALL = 1000  # largest number of areas of a map that is made for every excursion
 _REPEATS = 5
 _STEP, _TURN = 0.1, 10  # m and degrees between scans
 _PERIOD = 200_000_000  # ns
@@ -85,21 +84,21 @@ _DPI = 110
 
 
 def measure_scale(settings: Settings) -> Report:
-    """Time cuts and scans, weigh a stored area."""
-    configuration = load_configuration(PARAMETERS, list(settings.changes))
+    """Measure times of cuts, scans and files, and the memory of an area."""
+    configuration = settings.configuration
     report = Report("scale", "Cost against the number of areas", seeds=(0,))
     cuts = {lattice.areas: measured_cuts(lattice, configuration) for lattice in (*SMALL, *LARGE)}
     report.requirements += [cut_requirement(areas, cuts[areas]) for areas in CUT_BOUNDS]
     stressed = measured_cuts(LARGE[0], load_configuration(PARAMETERS, [*settings.changes, *STRESS]), _FEW)
     scans = cost_of_scans(SMALL, configuration)
     report.requirements += [growth_requirement(process, scans) for process in ("slam", "rtl")]
-    area = stored(LARGE[0])
+    area = weigh_areas(LARGE[0])
     report.requirements.append(Requirement("memory of a stored area with its scans", area.whole, STORED, "kB"))
-    saved = lasting(LASTING, configuration)
+    saved = time_saving(LASTING, configuration)
     name = f"saving and loading a map of {saved.areas} areas"
     report.requirements.append(Requirement(name, saved.whole, SAVED_AND_LOADED, "s"))
     named = {str(areas): own for areas, own in cuts.items()} | {f"{LARGE[0].areas}, stress": stressed}
-    bound = _bound(configuration, [cut for own in named.values() for cut in own])
+    bound = _describe_bound(configuration, [cut for own in named.values() for cut in own])
     report.body += [_cut_table(named), bound, _scan_table(scans), _stored_table(area), _lasting_table(saved), POLICY]
     report.data |= {
         "cuts": {name: [cut._asdict() for cut in own] for name, own in named.items()},
@@ -113,12 +112,12 @@ def measure_scale(settings: Settings) -> Report:
 
 
 def cut_requirement(areas: int, cuts: Sequence[Cut]) -> Requirement:
-    """That no cut takes longer than is asked for."""
+    """Requirement on the longest cut."""
     return Requirement(f"longest cut at {areas} areas", max(cut.ms for cut in cuts), CUT_BOUNDS[areas], "ms")
 
 
 def growth_requirement(process: str, scans: Mapping[int, Mapping[str, float]]) -> Requirement:
-    """That a scan costs the same in the largest map as in the smallest.
+    """Requirement on the growth of the cost of a scan from the smallest to the largest map.
 
     :param scans: {number of areas: {process: ms a scan}}.
     """
@@ -130,25 +129,18 @@ def growth_requirement(process: str, scans: Mapping[int, Mapping[str, float]]) -
 def _cut_table(cuts: Mapping[str, Sequence[Cut]]) -> str:
     head = ["areas", "cuts", "median [ms]", "95 %", "max", "cuts near known areas", "median [ms]", "95 %", "max"]
     head += ["areas compared at most", "hypotheses at most", "not examined at most"]
-    return table(head, [_cut_row(name, own) for name, own in cuts.items()])
+    rows = []
+    for name, own in cuts.items():
+        near = [cut for cut in own if cut.compared]
+        most = [max(getattr(cut, count) for cut in own) for count in ("compared", "hypotheses")]
+        unexamined = f"{max(cut.unexamined for cut in own):.3f}"
+        times = [name, str(len(own)), *_quantiles(own), str(len(near)), *_quantiles(near)]
+        rows.append([*times, *map(str, most), unexamined])
+    return table(head, rows)
 
 
-def _cut_row(name: str, cuts: Sequence[Cut]) -> list[str]:
-    near = [cut for cut in cuts if cut.compared]
-    return [
-        name,
-        str(len(cuts)),
-        *_quantiles(cuts),
-        str(len(near)),
-        *_quantiles(near),
-        str(max(cut.compared for cut in cuts)),
-        str(max(cut.hypotheses for cut in cuts)),
-        f"{max(cut.unexamined for cut in cuts):.3f}",
-    ]
-
-
-def _bound(configuration: Configuration, cuts: Sequence[Cut]) -> str:
-    """How long a cut can take."""
+def _describe_bound(configuration: Configuration, cuts: Sequence[Cut]) -> str:
+    """A sentence with the upper bound of the time of a cut."""
     options = configuration.tsbi
     most = options.max_comparisons + MIN_EXAMINED_AREAS * options.max_hypotheses
     each = max(cut.ms / cut.compared for cut in cuts if cut.compared)
@@ -171,27 +163,27 @@ def _scan_table(scans: Mapping[int, Mapping[str, float]]) -> str:
     return table(["areas", *(f"{process} [ms a scan]" for process in processes)], rows)
 
 
-def _stored_table(area: Stored) -> str:
+def _stored_table(area: AreaMemory) -> str:
     rows: list[tuple[str, Any]] = [
         ("poses of its keyframes and arcs", area.graph),
         ("scans of its keyframes", area.scans),
-        ("their end points, kept where the area was compared", area.points),
+        ("their end points, cached if the area was compared", area.points),
     ]
     return table(["of a stored area", "memory [kB]"], [[name, f"{size:.2f}"] for name, size in rows])
 
 
-def _lasting_table(saved: Lasting) -> str:
+def _lasting_table(saved: SaveTimes) -> str:
     head = ["areas", "files [MB]", "save [s]", "load [s]", "load the map alone [s]"]
     return table(head, [[str(saved.areas), *(f"{value:.1f}" for value in saved[1:])]])
 
 
 class Cut(NamedTuple):
-    """One cut.
+    """The cost of a cut.
 
     :ivar ms: CPU time from the keyframe to the acceptance.
-    :ivar compared: known areas that the keyframes were compared with, under all hypotheses.
-    :ivar hypotheses: alive after it.
-    :ivar unexamined: probability of what was not looked at.
+    :ivar compared: number of known areas compared with the keyframes, under all hypotheses.
+    :ivar hypotheses: number of live hypotheses after it.
+    :ivar unexamined: probability that was not examined.
     """
 
     ms: float
@@ -201,7 +193,7 @@ class Cut(NamedTuple):
 
 
 class _TimedTsbi:
-    """A TSBI in a map, of which the CPU time and the comparisons are counted until they are taken."""
+    """TSBI in a map, which counts CPU time and comparisons between calls of ``take``."""
 
     def __init__(self, lattice: Lattice, configuration: Configuration) -> None:
         self._lattice = lattice
@@ -211,17 +203,17 @@ class _TimedTsbi:
     def _branching(self, configuration: Configuration, replica: Replica) -> Branching:
         replica.maps[FIRST_HYPOTHESIS] = self._lattice.hybrid_map()
         replica.scans = LatticeScans()
-        return WatchedBranching(configuration, replica, self._count)
+        return ObservedBranching(configuration, replica, self._count)
 
     def _count(self, examination: Examination) -> None:
         self._compared += len(examination.found.examined_areas)
 
     def handle(self, message: Message) -> list[Message]:
-        """As TSBI does."""
+        """Handle a message as TSBI."""
         begin = time.process_time()
-        said = self._tsbi.handle(message)
+        messages = self._tsbi.handle(message)
         self._seconds += time.process_time() - begin
-        return said
+        return messages
 
     def take(self) -> tuple[float, int]:
         """Milliseconds and comparisons since the last call."""
@@ -231,20 +223,20 @@ class _TimedTsbi:
 
 
 def measured_cuts(lattice: Lattice, configuration: Configuration, excursions: int = _EXCURSIONS) -> list[Cut]:
-    """The cuts of some ways out of the map and back in, after one that compiles kernels and is not counted."""
-    _Robot(Lattice(5, 2), configuration).excursion(0, 0)
+    """The cuts of some excursions out of the map, after one that compiles kernels and does not count."""
+    _ExcursionRobot(Lattice(5, 2), configuration).excursion(0, 0)
     cuts: list[Cut] = []
-    robot = _Robot(lattice, configuration)
+    robot = _ExcursionRobot(lattice, configuration)
     for seed in range(excursions):
         if lattice.areas <= _SMALL:
-            cuts += _Robot(lattice, configuration).excursion(0, seed)
+            cuts += _ExcursionRobot(lattice, configuration).excursion(0, seed)
         else:
             cuts += robot.excursion(seed * (_LONGEST + 2), seed)
     return cuts
 
 
-class _Robot:
-    """Drives out of a lattice and back in."""
+class _ExcursionRobot:
+    """A robot that drives out of a lattice and back in."""
 
     def __init__(self, lattice: Lattice, configuration: Configuration) -> None:
         self._lattice = lattice
@@ -253,46 +245,46 @@ class _Robot:
         self._poses = lattice.poses()
 
     def excursion(self, column: int, seed: int) -> list[Cut]:
-        """The cuts on the way from a crossing of row 0 along row -2 to a later crossing of row 0, and into row 1."""
+        """The cuts on a path from a crossing of row 0 along row -2 to a later crossing of row 0, and into row 1."""
         end = min(column + _LONGEST, self._lattice.columns - 1)
         way = [(column, 0), (column, -1), *((c, -2) for c in range(column, end + 1)), (end, -1), (end, 0), (end, 1)]
         self._script.go_to(column, shared_scan(0.0, 0))
         random = np.random.default_rng(seed)
-        here, cuts = np.array([SPACING * column, 0.0, 0.0]), []
-        for stop in stops(way):
+        pose, cuts = np.array([SPACING * column, 0.0, 0.0]), []
+        for stop in make_stops(way):
             error = se2.exp(random.multivariate_normal(np.zeros(3), STEP))
-            step, here = se2.compose(se2.between(here, stop.pose), error), stop.pose
+            step, pose = se2.compose(se2.between(pose, stop.pose), error), stop.pose
             self._timed.take()
-            said = self._script.keyframe(step, stop.scan, len(OFFSETS) if stop.last else 0)
-            if len(said.hypotheses) == 1 or stop.pose[1] > SPACING:
-                best = max(said.hypotheses, key=lambda leaf: leaf.probability)
+            answer = self._script.keyframe(step, stop.scan, len(OFFSETS) if stop.last else 0)
+            if len(answer.hypotheses) == 1 or stop.pose[1] > SPACING:
+                best = max(answer.hypotheses, key=lambda hypothesis: hypothesis.probability)
                 self._script.accept(best.id, self._poses)
             if stop.last:
-                cuts.append(Cut(*self._timed.take(), len(said.hypotheses), said.unexamined))
+                cuts.append(Cut(*self._timed.take(), len(answer.hypotheses), answer.unexamined))
         return cuts
 
 
 class _TimedProcess:
-    """A process whose CPU time is counted."""
+    """A process that counts its CPU time."""
 
     def __init__(self, process: Process) -> None:
         self._process = process
         self.seconds = 0.0
 
     def handle(self, message: Message) -> list[Message]:
-        """As the process does."""
+        """Handle a message as the process."""
         begin = time.process_time()
-        said = self._process.handle(message)
+        messages = self._process.handle(message)
         self.seconds += time.process_time() - begin
-        return said
+        return messages
 
 
 def cost_of_scans(
     lattices: Sequence[Lattice], configuration: Configuration, repeats: int = _REPEATS
 ) -> dict[int, dict[str, float]]:
-    """{number of areas: {process: ms a scan}}, medians; the maps take turns, so that all see the same machine."""
-    _costs(lattices[0], configuration)
-    measured = [{lattice.areas: _costs(lattice, configuration) for lattice in lattices} for _ in range(repeats)]
+    """{number of areas: {process: median ms a scan}}, with the maps in turn, for the same load of the machine."""
+    _scan_costs(lattices[0], configuration)
+    measured = [{lattice.areas: _scan_costs(lattice, configuration) for lattice in lattices} for _ in range(repeats)]
     return {
         lattice.areas: {
             process: float(np.median([costs[lattice.areas][process] for costs in measured]))
@@ -302,16 +294,16 @@ def cost_of_scans(
     }
 
 
-def _costs(lattice: Lattice, configuration: Configuration) -> dict[str, float]:
+def _scan_costs(lattice: Lattice, configuration: Configuration) -> dict[str, float]:
     """{process: ms a scan} of one drive around the loop."""
     slam, aam, tlca = MetricSlam(configuration), Aam(configuration), Tlca(configuration)
-    tsbi = Tsbi(configuration, lambda c, replica: Branching(c, _filled(replica, lattice)))
+    tsbi = Tsbi(configuration, lambda c, replica: Branching(c, _fill_replica(replica, lattice)))
     for process in (slam, aam, tlca):
-        _filled(process._replica, lattice)
+        _fill_replica(process._replica, lattice)
     processes: dict[str, Process] = {"slam": slam, "aam": aam, "tsbi": tsbi, "tlca": tlca, "rtl": Rtl(configuration)}
     timed = {name: _TimedProcess(process) for name, process in processes.items()}
     lock_step = LockStep(timed)
-    poses = _drive()
+    poses = _loop_poses()
     for k, pose in enumerate(poses):
         stamp = _PERIOD * (k + 1)
         lock_step.feed(Odometry(stamp, pose))
@@ -319,15 +311,15 @@ def _costs(lattice: Lattice, configuration: Configuration) -> dict[str, float]:
     return {name: 1e3 * process.seconds / len(poses) for name, process in timed.items()}
 
 
-def _filled(replica: Replica, lattice: Lattice) -> Replica:
-    """A replica that knows the map, as if its process had been there."""
+def _fill_replica(replica: Replica, lattice: Lattice) -> Replica:
+    """Fill a replica with the map, and return it."""
     replica.maps[FIRST_HYPOTHESIS] = lattice.hybrid_map()
     replica.scans = LatticeScans()
     return replica
 
 
-def _drive() -> Float64:
-    """Poses around the loop, turning on the spot at its corners, shape (n, 3)."""
+def _loop_poses() -> Float64:
+    """Poses around the loop, turning in place at its corners, shape (n, 3)."""
     poses: list[Float64] = []
     for side, (start, end) in enumerate(pairwise(SPACING * np.array(_LOOP, dtype=np.float64))):
         heading = 0.5 * math.pi * side
@@ -343,11 +335,11 @@ def plot_scale(
     scans: Mapping[int, Mapping[str, float]],
     bounds: Mapping[int, float],
 ) -> None:
-    """Cost against the number of areas.
+    """Draw the cost against the number of areas.
 
     :param cuts: {number of areas: ms of each cut}.
     :param scans: {number of areas: {process: ms a scan}}.
-    :param bounds: {number of areas: ms that a cut may take}.
+    :param bounds: {number of areas: largest time of a cut, ms}.
     """
     figure = Figure(figsize=(10.0, 4.0), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -361,8 +353,6 @@ def plot_scale(
         right.plot(list(scans), [own[process] for own in scans.values()], "o-", label=process)
     right.set_ylabel("time of a scan [ms]")
     for axes in (left, right):
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xlabel("areas")
+        axes.set(xscale="log", yscale="log", xlabel="areas")
         axes.legend(fontsize=7)
     figure.savefig(path, dpi=_DPI)

@@ -1,4 +1,4 @@
-"""Maps of many areas on disk and in memory: time to save and load, and what an area takes."""
+"""Maps of many areas on disk and in memory: times of saving and loading, and memory of an area."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from hmt_slam_ros.saved_map.folder import replace_folder
 from hmt_slam_ros.sensors import Scan
 
 BEAMS = 181
-"""Of the scans that are saved or weighed."""
+"""Beams of the scans that are saved or measured."""
 
 SCANS_PER_KEYFRAME = 10
-"""Scans of the log to each keyframe, of which the trajectory has a pose."""
+"""Scans of the log, with poses in the trajectory, for each keyframe."""
 
 _PERIOD = 100_000_000  # ns
 _DRIVE, _SECONDS = "sim:office", 20.0
@@ -42,35 +42,35 @@ _AREAS_OF_SCANS = 100
 Made = TypeVar("Made")
 
 
-class Lasting(NamedTuple):
-    """A map that was saved and loaded.
+class SaveTimes(NamedTuple):
+    """Times of saving and loading a map.
 
-    :ivar areas: of it.
+    :ivar areas: number of areas.
     :ivar megabytes: of its files.
     :ivar save: s, from the running processes to the last byte on the disk.
-    :ivar load: s, from the files to processes that can go on.
-    :ivar look: s, from the files to the map alone, without the state.
+    :ivar load: s, from the files to processes that can continue.
+    :ivar load_map: s, from the files to the map without the state.
     """
 
     areas: int
     megabytes: float
     save: float
     load: float
-    look: float
+    load_map: float
 
     @property
     def whole(self) -> float:
-        """Saving and loading, s."""
+        """Time of saving and loading, s."""
         return self.save + self.load
 
 
-def lasting(lattice: Lattice, configuration: Configuration) -> Lasting:
-    """Save and load a map of all crossings of a lattice, after a first one that loads code and is not counted."""
-    _saved_and_loaded(Lattice(5, 2), configuration)
-    return _saved_and_loaded(lattice, configuration)
+def time_saving(lattice: Lattice, configuration: Configuration) -> SaveTimes:
+    """Save and load a map of all crossings of a lattice, after a small one that loads code and does not count."""
+    _time_once(Lattice(5, 2), configuration)
+    return _time_once(lattice, configuration)
 
 
-def _saved_and_loaded(lattice: Lattice, configuration: Configuration) -> Lasting:
+def _time_once(lattice: Lattice, configuration: Configuration) -> SaveTimes:
     run = LockStepRun(configuration, state=state_of(lattice, configuration))
     with tempfile.TemporaryDirectory() as folder:
         scratch, directory = Path(folder) / "new", Path(folder) / "hmt_map"
@@ -89,31 +89,31 @@ def _saved_and_loaded(lattice: Lattice, configuration: Configuration) -> Lasting
         LockStepRun(configuration, state=read_run_state(directory)[0])
         loaded = time.perf_counter()
         read_saved_map(directory)
-        looked = time.perf_counter()
+        map_loaded = time.perf_counter()
         size = sum(path.stat().st_size for path in directory.iterdir()) / 1e6
-    return Lasting(lattice.areas, size, written - begin, loaded - written, looked - loaded)
+    return SaveTimes(lattice.areas, size, written - begin, loaded - written, map_loaded - loaded)
 
 
 def state_of(lattice: Lattice, configuration: Configuration) -> RunState:
-    """The state of a run that mapped all crossings of a lattice, each by a way of its own through it.
+    """The state of a run that mapped all crossings of a lattice, each by a separate path.
 
     The particle filter is that of a drive through a simulated building.
     """
-    driven = _driven(configuration)
+    drive_state = _drive_state(configuration)
     hybrid_map = lattice.hybrid_map()
     keyframes = [k for area in hybrid_map.area_ids() for k in hybrid_map.keyframes(area)]
-    scans = {k: _own(shared_scan((k - FIRST_KEYFRAME) % 2 * 1.6, 0), k) for k in keyframes}
-    maps, one = {FIRST_HYPOTHESIS: hybrid_map}, {FIRST_HYPOTHESIS: 1.0}
-    replica = Replica(scans, maps, one, {FIRST_HYPOTHESIS: 0}).state
-    placed = KeyframeCovariances.from_dict(dict.fromkeys(keyframes, ARC))
+    scans = {k: _own_scan(shared_scan((k - FIRST_KEYFRAME) % 2 * 1.6, 0), k) for k in keyframes}
+    maps, probabilities = {FIRST_HYPOTHESIS: hybrid_map}, {FIRST_HYPOTHESIS: 1.0}
+    replica = Replica(scans, maps, probabilities, {FIRST_HYPOTHESIS: 0}).state
+    covariances = KeyframeCovariances.from_dict(dict.fromkeys(keyframes, ARC))
     live = {
-        hypothesis: replace(own, keyframe_covariances=placed)
-        for hypothesis, own in driven.processes["slam"].live_hypotheses.items()
+        hypothesis: replace(own, keyframe_covariances=covariances)
+        for hypothesis, own in drive_state.processes["slam"].live_hypotheses.items()
     }
     graph = OverlapGraph(tuple(range(PER_AREA)), np.full((PER_AREA, PER_AREA), 0.5))
     graphs = {a: replace(graph, keyframes=tuple(hybrid_map.keyframes(a))) for a in hybrid_map.area_ids()}
-    watch = Partition(0, {area: area for area in hybrid_map.area_ids()}, frozenset(keyframes[:PER_AREA]))
-    path = driven.processes["tlca"].paths[FIRST_HYPOTHESIS]
+    partition = Partition(0, {area: area for area in hybrid_map.area_ids()}, frozenset(keyframes[:PER_AREA]))
+    path = drive_state.processes["tlca"].paths[FIRST_HYPOTHESIS]
     arcs = [(a, b) for a, b, _ in hybrid_map.all_arcs()]
     steps = tuple(PathStep(k, a, b, ((a, b),), frozenset({k})) for k, (a, b) in enumerate(arcs))
     path = replace(path, arc_keyframes={pair: frozenset(pair) for pair in arcs}, history=steps)
@@ -121,20 +121,20 @@ def state_of(lattice: Lattice, configuration: Configuration) -> RunState:
         _log_state(keyframes),
         {
             "slam": replace(
-                driven.processes["slam"], replica=replica, live_hypotheses=live, keyframe_events=len(keyframes)
+                drive_state.processes["slam"], replica=replica, live_hypotheses=live, keyframe_events=len(keyframes)
             ),
             "aam": replace(
-                driven.processes["aam"], replica=replica, graphs=graphs, partitions={FIRST_HYPOTHESIS: watch}
+                drive_state.processes["aam"], replica=replica, graphs=graphs, partitions={FIRST_HYPOTHESIS: partition}
             ),
-            "tsbi": replace(driven.processes["tsbi"], replica=replica, global_poses=lattice.poses()),
-            "tlca": replace(driven.processes["tlca"], replica=replica, paths={FIRST_HYPOTHESIS: path}),
-            "rtl": replace(driven.processes["rtl"], area_poses=lattice.poses()),
+            "tsbi": replace(drive_state.processes["tsbi"], replica=replica, global_poses=lattice.poses()),
+            "tlca": replace(drive_state.processes["tlca"], replica=replica, paths={FIRST_HYPOTHESIS: path}),
+            "rtl": replace(drive_state.processes["rtl"], area_poses=lattice.poses()),
         },
-        replace(driven.recorder, replica=replica, **_recorded(keyframes)),
+        replace(drive_state.recorder, replica=replica, **_recorder_fields(keyframes)),
     )
 
 
-def _driven(configuration: Configuration) -> RunState:
+def _drive_state(configuration: Configuration) -> RunState:
     """The state after the first seconds of a simulated drive."""
     run = LockStepRun(configuration)
     for record in open_log(_DRIVE, duration=_SECONDS).records():
@@ -142,8 +142,8 @@ def _driven(configuration: Configuration) -> RunState:
     return run.state
 
 
-def _own(scan: Scan, keyframe: int) -> Scan:
-    """A scan of a keyframe's own, of ``BEAMS`` beams."""
+def _own_scan(scan: Scan, keyframe: int) -> Scan:
+    """A distinct scan of a keyframe, of ``BEAMS`` beams."""
     ranges = np.resize(scan.ranges, BEAMS) + np.float32(1e-6 * (keyframe - FIRST_KEYFRAME))
     return replace(scan, stamp=_stamp(keyframe), ranges=ranges)
 
@@ -153,13 +153,13 @@ def _stamp(keyframe: int) -> int:
 
 
 def _log_state(keyframes: Sequence[int]) -> LogProgress:
-    """A log with a reading of the odometry to each scan."""
+    """The progress of a log with an odometry reading for each scan."""
     stamps = _stamp(keyframes[0]) + _PERIOD * np.arange(len(keyframes) * SCANS_PER_KEYFRAME)
     return LogProgress(2 * stamps.size, stamps, stamps)
 
 
-def _recorded(keyframes: Sequence[int]) -> dict[str, Any]:
-    """What the recorder keeps of all scans and of the events, a keyframe each."""
+def _recorder_fields(keyframes: Sequence[int]) -> dict[str, Any]:
+    """Fields of the recorder for all scans, and for events with a keyframe each."""
     scans = np.arange(len(keyframes) * SCANS_PER_KEYFRAME)
     stamps, poses = _stamp(keyframes[0]) + _PERIOD * scans, np.zeros((scans.size, 3))
     each = zip(np.split(scans, len(keyframes)), np.split(stamps, len(keyframes)), keyframes, strict=True)
@@ -179,12 +179,12 @@ def _recorded(keyframes: Sequence[int]) -> dict[str, Any]:
     }
 
 
-class Stored(NamedTuple):
+class AreaMemory(NamedTuple):
     """Memory of a stored area, kB.
 
     :ivar graph: poses of its keyframes and its arcs.
     :ivar scans: the scans of its keyframes, as received.
-    :ivar points: their end points, where something asked for them.
+    :ivar points: their end points, if they were computed.
     """
 
     graph: float
@@ -193,25 +193,25 @@ class Stored(NamedTuple):
 
     @property
     def whole(self) -> float:
-        """What cannot be built anew from the rest, kB."""
+        """Memory of all data that cannot be computed from other data, kB."""
         return self.graph + self.scans
 
 
-def stored(lattice: Lattice) -> Stored:
-    """Weigh the areas of a lattice, each with its own scans."""
-    graph = _weight(lattice.hybrid_map)[0] / lattice.areas
-    _weighed(0)
-    scans, kept = _weight(lambda: [_weighed(keyframe) for keyframe in range(_AREAS_OF_SCANS * PER_AREA)])
-    points, _ = _weight(lambda: [scan.points for scan in kept])
-    return Stored(graph, scans / _AREAS_OF_SCANS, points / _AREAS_OF_SCANS)
+def weigh_areas(lattice: Lattice) -> AreaMemory:
+    """Measure the memory of the areas of a lattice, each with distinct scans."""
+    graph = _measure_memory(lattice.hybrid_map)[0] / lattice.areas
+    _make_scan(0)
+    scans, kept = _measure_memory(lambda: [_make_scan(keyframe) for keyframe in range(_AREAS_OF_SCANS * PER_AREA)])
+    points, _ = _measure_memory(lambda: [scan.points for scan in kept])
+    return AreaMemory(graph, scans / _AREAS_OF_SCANS, points / _AREAS_OF_SCANS)
 
 
-def _weighed(keyframe: int) -> Scan:
+def _make_scan(keyframe: int) -> Scan:
     return scan_at(np.zeros(3), keyframe, keyframe, BEAMS)
 
 
-def _weight(make: Callable[[], Made]) -> tuple[float, Made]:
-    """What something takes, kB, and the thing itself."""
+def _measure_memory(make: Callable[[], Made]) -> tuple[float, Made]:
+    """The memory of a value, kB, and the value."""
     tracemalloc.start()
     try:
         made = make()

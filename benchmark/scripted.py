@@ -1,6 +1,6 @@
-"""A stand-in for metric SLAM, area abstraction and acceptance around a TSBI: dead reckoning, and cuts by a script.
+"""A replacement of metric SLAM, area abstraction and acceptance for TSBI: dead reckoning, and scripted cuts.
 
-TSBI gets what it would get from them, and nothing else decides on topologies.
+TSBI gets the same messages as from them, and decides on topologies alone.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _START = np.diag([1e-8, 1e-8, 1e-8])
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """What metric SLAM knows under one hypothesis.
+    """The belief of metric SLAM under one hypothesis.
 
     :ivar area: the robot's.
     :ivar pose: belief over ``area_T_base``.
@@ -47,14 +47,14 @@ class Robot:
     area: int = FIRST_AREA
     pose: PoseGaussian = field(default_factory=lambda: PoseGaussian(np.zeros(3), _START))
 
-    def moved(self, step: Float64, noise: float) -> Robot:
-        """After a motion (3,) by the odometry, of which the deviations are those of ``STEP`` times ``noise``."""
+    def move(self, step: Float64, noise: float) -> Robot:
+        """The robot after a motion (3,) by odometry, with the deviations of ``STEP`` times ``noise``."""
         return Robot(self.area, self.pose.compose(PoseGaussian(step, noise**2 * STEP)))
 
-    def entered(self, area: int, rebase: PoseGaussian | None, keyframes: int, noise: float) -> Robot:
-        """After TSBI's answer.
+    def enter(self, area: int, rebase: PoseGaussian | None, keyframes: int, noise: float) -> Robot:
+        """The robot after TSBI's answer.
 
-        :param keyframes: how many came over into the area.
+        :param keyframes: number of keyframes that moved into the area.
         :param noise: as for :meth:`moved`.
         """
         if rebase is None:
@@ -64,10 +64,10 @@ class Robot:
 
 
 class Script:
-    """Drives a TSBI.
+    """Sends keyframe events to TSBI.
 
     :ivar sequence: number of the last keyframe event.
-    :ivar robots: {hypothesis: what metric SLAM would know}.
+    :ivar robots: {hypothesis: belief of metric SLAM}.
     :ivar hypotheses: the last answer.
     """
 
@@ -80,43 +80,45 @@ class Script:
         self.hypotheses = Hypotheses(self.sequence, (Hypothesis(FIRST_HYPOTHESIS, FIRST_HYPOTHESIS, 1.0, FIRST_AREA),))
 
     def keyframe(self, step: Float64, scan: Scan, cut: int = 0) -> Hypotheses:
-        """One keyframe event.
+        """Send a keyframe event; return TSBI's answer.
 
         :param step: the motion (3,) since the last one as the odometry has it.
-        :param cut: how many of the newest keyframes leave the area, under every hypothesis; 0 for none.
+        :param cut: number of newest keyframes that leave the area, under every hypothesis; 0 for none.
         """
-        self.robots = {hypothesis: robot.moved(step, self._noise) for hypothesis, robot in self.robots.items()}
+        self.robots = {hypothesis: robot.move(step, self._noise) for hypothesis, robot in self.robots.items()}
         newest = tuple(range(self.sequence + 2 - cut, self.sequence + 2))
         events = [AreaEvent(h, "cut", newest, robot.area, 0.0) for h, robot in sorted(self.robots.items()) if cut]
         return self._event(scan, events)
 
     def go_to(self, area: int, scan: Scan) -> None:
-        """Go to the origin of a known area, under the one hypothesis that there is."""
+        """Move to the origin of a known area, under the only hypothesis."""
         (hypothesis,) = self.robots
         self._event(scan, [AreaEvent(hypothesis, "moved", (), area, 1.0)], stored=False)
         self.robots = {hypothesis: Robot(area)}
 
     def accept(self, hypothesis: int, global_poses: tuple[AreaPose, ...] = ()) -> None:
-        """Make a hypothesis definite."""
-        self._tell(ClosureDecision(self.sequence, hypothesis, global_poses=global_poses))
+        """Accept a hypothesis."""
+        self._send(ClosureDecision(self.sequence, hypothesis, global_poses=global_poses))
         self.robots = {hypothesis: self.robots[hypothesis]}
 
     def _event(self, scan: Scan, events: Sequence[AreaEvent], *, stored: bool = True) -> Hypotheses:
         self.sequence += 1
-        leaves = tuple(
+        estimates = tuple(
             HypothesisEstimate(hypothesis, robot.area, robot.pose, stored, 0.0, 0.0, Clutter(), 1.0)
             for hypothesis, robot in sorted(self.robots.items())
         )
-        self._tell(Keyframe(self.sequence, scan, 0.0, leaves))
-        (answer,) = self._tell(AreaEvents(self.sequence, tuple(events)))
+        self._send(Keyframe(self.sequence, scan, 0.0, estimates))
+        (answer,) = self._send(AreaEvents(self.sequence, tuple(events)))
         assert isinstance(answer, Hypotheses)
         before = self.robots
         self.robots = {
-            leaf.id: before[leaf.parent].entered(leaf.area, leaf.frame_change, len(leaf.moved_keyframes), self._noise)
-            for leaf in answer.hypotheses
+            hypothesis.id: before[hypothesis.parent].enter(
+                hypothesis.area, hypothesis.frame_change, len(hypothesis.moved_keyframes), self._noise
+            )
+            for hypothesis in answer.hypotheses
         }
         self.hypotheses = answer
         return answer
 
-    def _tell(self, message: Message) -> list[Message]:
+    def _send(self, message: Message) -> list[Message]:
         return self._tsbi.handle(message)

@@ -1,13 +1,14 @@
-"""Settings of a measurement, and the worlds, seeds and records that it asks for."""
+"""Settings of a measurement, and the worlds, seeds and records that they select."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmark.runs import Runner
+from benchmark.runs import PARAMETERS, Runner
 from benchmark.simulated.records import Record, Records
 from benchmark.simulated.worlds import FAMILIES, World, seeds
+from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 
 SEEDS = 40
@@ -18,14 +19,14 @@ SEEDS = 40
 class Settings:
     """Settings of a measurement.
 
-    :ivar logs: names of the logs, or families of simulated worlds, empty for those that the measurement is meant for.
-    :ivar seeds: of the runs, empty for as many as the measurement is meant for.
+    :ivar logs: names of logs or families of simulated worlds; empty for the measurement's own choice.
+    :ivar seeds: of the runs; empty for the measurement's own choice.
     :ivar changes: parameters that differ from the file, as ``name=value``.
     :ivar out: folder of the report.
-    :ivar write_expected: whether the short form writes what it is to compare with.
-    :ivar runner: runs what is asked for, each case once for all measurements.
+    :ivar write_expected: whether the figures to compare with are written.
+    :ivar runner: runs each case once for all measurements.
     :ivar records: the same for simulated worlds.
-    :ivar training: whether those are the worlds of the training seeds.
+    :ivar training: whether simulated worlds have training seeds instead of validation seeds.
     :ivar minutes: how long the nodes run in soak.
     """
 
@@ -39,25 +40,30 @@ class Settings:
     training: bool = False
     minutes: float = 60.0
 
+    @property
+    def configuration(self) -> Configuration:
+        """The configuration of the parameter file, with the changes."""
+        return load_configuration(PARAMETERS, list(self.changes))
+
     def logs_or(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """The logs asked for, or those of the measurement."""
+        """The selected logs, by default ``names``."""
         return self.logs or names
 
     def seeds_or(self, count: int) -> tuple[int, ...]:
-        """The seeds asked for, or the first ones."""
+        """The selected seeds, by default the first ``count``."""
         return self.seeds or tuple(range(count))
 
 
 def chosen_seeds(settings: Settings, count: int = SEEDS) -> tuple[int, ...]:
-    """Those for training or for validation, as many as are asked for, else ``count``."""
+    """Training or validation seeds of simulated worlds, by default ``count`` of them."""
     return seeds(len(settings.seeds_or(count)), training=settings.training)
 
 
 def chosen_families(settings: Settings, families: tuple[str, ...], known: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """Those that are asked for, else ``families``.
+    """The selected families, by default ``families``.
 
-    :param known: all that may be asked for, if there are more.
-    :raises HmtSlamError: for a name that is none of them.
+    :param known: all families that may be selected, by default ``families``.
+    :raises HmtSlamError: for an unknown name.
     """
     chosen, known = settings.logs_or(families), known or families
     for name in chosen:
@@ -66,22 +72,22 @@ def chosen_families(settings: Settings, families: tuple[str, ...], known: tuple[
     return tuple(chosen)
 
 
-def records_of(
+def make_records(
     settings: Settings, families: tuple[str, ...] = FAMILIES, count: int = SEEDS, others: tuple[str, ...] = ()
 ) -> list[Record]:
-    """The records of some families, those of one family one after the other.
+    """The records of some families, in the order of families and seeds.
 
-    :param count: of the seeds where none are asked for.
-    :param others: worlds that are no families, and mapped only where they are asked for by their names.
+    :param count: number of seeds, if none are selected.
+    :param others: further worlds, which are mapped only if they are selected by name.
 
-    :raises HmtSlamError: for a name that is no family, or a run that failed.
+    :raises HmtSlamError: for an unknown name or a failed run.
     """
     chosen = chosen_families(settings, families, (*FAMILIES, *others))
     mapped, numbers = (family for family in (*families, *others) if family in chosen), chosen_seeds(settings, count)
     worlds = [World(family, seed) for family in mapped for seed in numbers]
-    return settings.records.of(worlds, settings.changes)
+    return settings.records.make(worlds, settings.changes)
 
 
-def by_family(records: list[Record]) -> dict[str, list[Record]]:
+def group_by_family(records: list[Record]) -> dict[str, list[Record]]:
     """The records of each family."""
     return {family: own for family in FAMILIES if (own := [record for record in records if record["family"] == family])}

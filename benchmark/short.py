@@ -7,7 +7,7 @@ it was written with. The mean over the few seeds of the short form may exceed th
 
 that is by four standard errors of the difference of two such means: with ten seeds, one false alarm in about 600
 figures (Student, 9 degrees of freedom). The 2 % are for figures that hardly depend on the seed. A change for the
-better, or for the worse on purpose, is put on record with ``python -m benchmark short --write-expected``.
+better, or for the worse on purpose, is recorded with ``python -m benchmark short --write-expected``.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmark.logs import BUNDLED, MeasuredLog, missing, opened
-from benchmark.report import Report, Requirement, commit, table
+from benchmark.logs import BUNDLED, MeasuredLog, open_logs, reason_missing
+from benchmark.report import Report, Requirement, describe_commit, table
 from benchmark.runs import Case, Run, Runner
 from benchmark.scoring import FINAL, ONLINE, judge_walls, sample_deviation
 from benchmark.settings import Settings
@@ -36,7 +36,7 @@ SMALLEST_MARGIN = 0.02
 
 @dataclass(frozen=True)
 class Part:
-    """What of a log is run.
+    """The part of a log that is run.
 
     :ivar log: its name.
     :ivar duration: seconds of it, 0 for all.
@@ -71,9 +71,9 @@ Figures = dict[str, list[float]]
 
 
 def measure_short(settings: Settings) -> Report:
-    """Run the parts whose logs are there, and compare with what is expected, or write what is to be expected."""
+    """Run the parts whose logs are there, and compare the figures with expected ones, or record them."""
     report = Report("short", "Has accuracy become worse?", seeds=tuple(range(max(part.seeds for part in PARTS))))
-    figures = _measure(settings, report)
+    figures = _measure_parts(settings, report)
     if settings.write_expected:
         write_expected(EXPECTED, figures)
     expected = read_expected(EXPECTED)
@@ -85,13 +85,13 @@ def measure_short(settings: Settings) -> Report:
     return report
 
 
-def _measure(settings: Settings, report: Report) -> dict[str, Figures]:
-    reasons = {part.log: missing(part.log) for part in PARTS}
+def _measure_parts(settings: Settings, report: Report) -> dict[str, Figures]:
+    reasons = {part.log: reason_missing(part.log) for part in PARTS}
     if settings.write_expected and any(reasons.values()):
-        raise HmtSlamError(f"not all that is expected can be measured: {next(filter(None, reasons.values()))}")
+        raise HmtSlamError(f"not all expected figures can be measured: {next(filter(None, reasons.values()))}")
     report.body += [f"Skipped {log}: {reason}." for log, reason in reasons.items() if reason]
     parts = [part for part in PARTS if not reasons[part.log]]
-    with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder, opened([p.log for p in parts]) as logs:
+    with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder, open_logs([p.log for p in parts]) as logs:
         runner = Runner(Path(folder), settings.runner.jobs)
         cases = {
             log: [
@@ -100,7 +100,7 @@ def _measure(settings: Settings, report: Report) -> dict[str, Figures]:
             ]
             for part, log in zip(parts, logs, strict=True)
         }
-        # All at once, so that no core waits for the last run of a log.
+        # All cases are run together, so that no core waits for the last run of a log.
         runner.runs([case for own in cases.values() for case in own])
         report.body.append(_cost_table(runs := {log: runner.runs(own) for log, own in cases.items()}))
         return {log.name: figures_of(log, own) for log, own in runs.items()}
@@ -113,13 +113,13 @@ def _cost_table(runs: Mapping[MeasuredLog, Sequence[Run]]) -> str:
 
 def figures_of(log: MeasuredLog, runs: Sequence[Run]) -> Figures:
     """The figures of a log's runs."""
-    own = [_of_relations(log, run) if log.relations is not None else _of_walls(log, run) for run in runs]
+    own = [_relation_figures(log, run) if log.relations is not None else _wall_figures(log, run) for run in runs]
     return {name: [figures[name] for figures in own] for name in own[0]}
 
 
-def _of_relations(log: MeasuredLog, run: Run) -> dict[str, float]:
+def _relation_figures(log: MeasuredLog, run: Run) -> dict[str, float]:
     assert log.relations is not None
-    # Without the odometry: what lies beyond the part of the log that was run has to be missed.
+    # Without odometry, relations beyond the part of the log count as missed.
     final, online = (evaluate_relations(read_tum(run.folder / file), log.relations) for file in (FINAL, ONLINE))
     return {
         "translation_m": final.overall.translation.mean,
@@ -130,12 +130,12 @@ def _of_relations(log: MeasuredLog, run: Run) -> dict[str, float]:
     }
 
 
-def _of_walls(log: MeasuredLog, run: Run) -> dict[str, float]:
+def _wall_figures(log: MeasuredLog, run: Run) -> dict[str, float]:
     final, online = (judge_walls(log.scans, read_tum(run.folder / file).poses) for file in (FINAL, ONLINE))
     return {
         "disagreement": 1.0 - final.agreement,
         "disagreement_online": 1.0 - online.agreement,
-        "torn_stretches": float(len(final.torn)),
+        "torn_stretches": float(len(final.torn_stretches)),
         "stretches_over_new_ground": float(final.new),
     }
 
@@ -143,13 +143,13 @@ def _of_walls(log: MeasuredLog, run: Run) -> dict[str, float]:
 def regressions(log: str, figures: Figures, expected: Mapping[str, Expected]) -> list[Requirement]:
     """Each figure's mean over the seeds, and its bound.
 
-    :raises HmtSlamError: for a figure of which nothing is expected.
+    :raises HmtSlamError: for a figure without an expected value.
     """
     unknown = sorted(figures.keys() ^ expected.keys())
     if unknown:
         raise HmtSlamError(
             f"{EXPECTED.name} and the figures of {log} differ in {unknown[0]}: run 'python -m benchmark short "
-            "--write-expected' and look at what it changes"
+            "--write-expected' and check the changes"
         )
     requirements = []
     for name, values in figures.items():
@@ -160,7 +160,7 @@ def regressions(log: str, figures: Figures, expected: Mapping[str, Expected]) ->
 
 
 def read_expected(path: Path) -> dict[str, dict[str, Expected]]:
-    """{log: {figure: what is expected}}.
+    """{log: {figure: expected values}}.
 
     :raises HmtSlamError: where there is no such file.
     """
@@ -178,9 +178,9 @@ def read_expected(path: Path) -> dict[str, dict[str, Expected]]:
 def write_expected(path: Path, figures: Mapping[str, Figures]) -> None:
     """Write means and deviations over the seeds, of which every figure has as many."""
     lines = [
-        "# Means and sample deviations over some seeds; benchmark/short.py says how they become bounds.",
+        "# Means and sample deviations over some seeds, from which benchmark/short.py computes bounds.",
         "# Written by `python -m benchmark short --write-expected`; do not edit.",
-        f'commit = "{commit()}"',
+        f'commit = "{describe_commit()}"',
         f"seeds = {len(next(iter(next(iter(figures.values())).values())))}",
     ]
     for log, own in figures.items():

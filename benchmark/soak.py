@@ -1,4 +1,4 @@
-"""Memory of nodes over a long drive at ten times real time, and what they leave behind."""
+"""Memory of nodes over a long drive at ten times real time, and resources that they do not release."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
 
+from benchmark.charted_run import resident_bytes
 from benchmark.report import Report, Requirement, table
 from benchmark.settings import Settings
 from hmt_slam_ros.logs.records import SIMULATION_PREFIX
@@ -41,42 +42,41 @@ GROWTH = 0.05
 """Largest growth of a node's memory from the middle to the end."""
 
 _SHORTFALL = 0.95
-_PERIOD = 5.0  # s between two looks at memory
+_PERIOD = 5.0  # s between two samples of memory
 _SPIN = 0.1  # s
 _DEPARTURES = 3.0  # s
 _SHARED_MEMORY = "/dev/shm/"
-# Files of ports are named by their numbers, and the next participant takes over those that are there.
+# Files of ports are named by their numbers, and reused by the next participant.
 _PORT = "fastrtps_port"
 
 POLICY = (
-    f"The nodes, each an OS process of its own, map laps of `sim:{WORLD}` (seed 0), which the robot node plays at "
-    f"{RATE:g} times real time, waiting for slam where that falls behind. Resident memory is read every {_PERIOD:g} s. "
-    "In the first half the histories of DDS fill up, which have 5000 messages each; the growth is that of the mean of "
-    "the last tenth over the mean of the tenth after the middle. Segments of shared memory are those that one of the "
-    "nodes had mapped and that were still there when all had ended, but for those of ports, which the next nodes take "
-    "over; zombies are processes whose parent is a node, or "
-    "that were one, and that ended without anybody asking for their status."
+    f"The nodes, each an OS process, map laps of `sim:{WORLD}` (seed 0), which the robot node plays at "
+    f"{RATE:g} times real time, or slower if slam is behind. Resident memory is read every {_PERIOD:g} s. In the first "
+    "half the histories of DDS fill up, with 5000 messages each; the growth is that of the mean of the last tenth over "
+    "the mean of the tenth after the middle. Segments of shared memory are those that a node had mapped and that still "
+    "existed when all had ended. Segments of ports are excluded, because the next nodes reuse them. Zombies are ended "
+    "child processes of a node, or ended nodes, without a parent that read their status."
 )
 
 
 @dataclass
 class Soak:
-    """What a run came to.
+    """The measurements of a run.
 
-    :ivar seconds: on the wall.
-    :ivar driven: of the log, s.
+    :ivar seconds: wall time, s.
+    :ivar log_seconds: played time of the log, s.
     :ivar scans: acknowledged by slam.
-    :ivar resident: {node: memory at every look, bytes}.
-    :ivar segments: files of shared memory that the nodes had.
-    :ivar leaked: those that were there when all had ended.
-    :ivar zombies: largest number at a look.
-    :ivar errors: {node: what it said with level ERROR}.
+    :ivar resident: {node: memory at every sample, bytes}.
+    :ivar segments: files of shared memory of the nodes.
+    :ivar leaked: those that still existed when all nodes had ended.
+    :ivar zombies: largest number at a sample.
+    :ivar errors: {node: its last message of level ERROR}.
     :ivar dropped: scans that slam dropped.
-    :ivar statuses: {node: exit status when it was told to end}.
+    :ivar statuses: {node: exit status after the request to end}.
     """
 
     seconds: float = 0.0
-    driven: float = 0.0
+    log_seconds: float = 0.0
     scans: int = 0
     resident: dict[str, list[int]] = field(default_factory=dict)
     segments: set[str] = field(default_factory=set)
@@ -88,21 +88,25 @@ class Soak:
 
 
 def measure_soak(settings: Settings) -> Report:
-    """Drive as long as is asked for, and look."""
+    """Drive for some minutes, and sample the nodes."""
     report = Report("soak", "Long runs of the nodes", seeds=(0,))
-    found = soaked(settings.minutes)
+    found = run_nodes(settings.minutes)
     report.requirements += requirements(found)
     report.data["soak"] = asdict(found) | {name: sorted(getattr(found, name)) for name in ("segments", "leaked")}
-    rows = [[name, *(f"{1e-6 * value:.0f}" for value in _shown(own))] for name, own in found.resident.items()]
-    told = f"{found.seconds / 60:.0f} minutes, {found.driven / 3600:.1f} h of driving, {found.scans} scans"
-    report.body += [told, table(["node", "at 10 % [MB]", "at 50 %", "at 75 %", "at the end", "largest"], rows), POLICY]
+    rows = [[name, *(f"{1e-6 * value:.0f}" for value in _memory_samples(own))] for name, own in found.resident.items()]
+    summary = f"{found.seconds / 60:.0f} minutes, {found.log_seconds / 3600:.1f} h of driving, {found.scans} scans"
+    report.body += [
+        summary,
+        table(["node", "at 10 % [MB]", "at 50 %", "at 75 %", "at the end", "largest"], rows),
+        POLICY,
+    ]
     return report
 
 
 def requirements(found: Soak) -> list[Requirement]:
-    """What is asked for of a run."""
+    """Requirements on a run."""
     growths = [Requirement(f"{name}: growth of memory", growth(own), GROWTH) for name, own in found.resident.items()]
-    speed = found.driven / found.seconds
+    speed = found.log_seconds / found.seconds
     return [
         *growths,
         Requirement("speed, times real time", speed, math.inf, least=_SHORTFALL * RATE),
@@ -110,23 +114,25 @@ def requirements(found: Soak) -> list[Requirement]:
         Requirement("errors in /diagnostics", len(found.errors), 0),
         Requirement("segments of shared memory left behind", len(found.leaked), 0),
         Requirement("zombies", found.zombies, 0),
-        Requirement("nodes that did not end well", sum(status != 0 for status in found.statuses.values()), 0),
+        Requirement(
+            "nodes with an exit status other than 0", sum(status != 0 for status in found.statuses.values()), 0
+        ),
     ]
 
 
 def growth(resident: Sequence[int]) -> float:
-    """From the tenth after the middle to the last one, as a share; NaN where there were too few looks."""
+    """Growth of the mean from the tenth after the middle to the last one, as a share; NaN for too few samples."""
     tenth, middle = len(resident) // 10, len(resident) // 2
     if not tenth:
         return math.nan
     return float(np.mean(resident[-tenth:]) / np.mean(resident[middle : middle + tenth])) - 1.0
 
 
-def _shown(resident: Sequence[int]) -> list[int]:
+def _memory_samples(resident: Sequence[int]) -> list[int]:
     return [*(resident[round(share * (len(resident) - 1))] for share in (0.1, 0.5, 0.75, 1.0)), max(resident)]
 
 
-def soaked(minutes: float) -> Soak:
+def run_nodes(minutes: float) -> Soak:
     """Run the nodes for some minutes.
 
     :raises HmtSlamError: where one of them dies.
@@ -138,7 +144,7 @@ def soaked(minutes: float) -> Soak:
     with (
         tempfile.TemporaryDirectory(prefix="hmt_slam_soak_") as scratch,
         own_domain() as domain,
-        _listening(domain, found) as executor,
+        _listen(domain, found) as executor,
     ):
         with NodeProcesses(Path(scratch), (), print) as children:
             own = [] if TFMessage is not None else ["-p", f"laser_pose:={laser}"]
@@ -148,14 +154,14 @@ def soaked(minutes: float) -> Soak:
                 children.start(node, words, environment)
             robot = {"log": name, "robot.rate": RATE, "robot.odometry_listeners": 2, "robot.discovery_timeout": 600.0}
             children.start("robot", [w for k, v in robot.items() for w in ("-p", f"{k}:={v}")], environment)
-            _watch(executor, children, found, 60.0 * minutes)
+            _observe(executor, children, found, 60.0 * minutes)
         found.statuses = {node: process.returncode for node, process in children.processes.items()}
     found.leaked = {path for path in found.segments if Path(path).exists() and not _is_mapped(path)}
     return found
 
 
-def _watch(executor: SingleThreadedExecutor, children: NodeProcesses, found: Soak, seconds: float) -> None:
-    """Look at the nodes until so much time is over since the first scan."""
+def _observe(executor: SingleThreadedExecutor, children: NodeProcesses, found: Soak, seconds: float) -> None:
+    """Sample the nodes for some seconds since the first scan."""
     begin = next_look = None
     while begin is None or time.monotonic() < begin + seconds:
         executor.spin_once(timeout_sec=_SPIN)
@@ -165,24 +171,20 @@ def _watch(executor: SingleThreadedExecutor, children: NodeProcesses, found: Soa
             begin = next_look = now if found.scans else None
         elif now >= next_look:
             next_look += _PERIOD
-            _look({name: process.pid for name, process in children.processes.items()}, found)
+            _sample_processes({name: process.pid for name, process in children.processes.items()}, found)
             found.seconds = now - begin
 
 
-def _look(processes: Mapping[str, int], found: Soak) -> None:
+def _sample_processes(processes: Mapping[str, int], found: Soak) -> None:
     for name, pid in processes.items():
-        found.resident[name].append(_resident(pid))
-        found.segments |= _segments(pid)
-    states = Counter(state for state, parent in _states() if parent in (*processes.values(), os.getpid()))
+        found.resident[name].append(resident_bytes(pid))
+        found.segments |= _mapped_segments(pid)
+    states = Counter(state for state, parent in _process_states() if parent in (*processes.values(), os.getpid()))
     found.zombies = max(found.zombies, states["Z"])
 
 
-def _resident(pid: int) -> int:
-    return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
-def _segments(pid: int) -> set[str]:
-    """Files of shared memory that a process has mapped and that are there."""
+def _mapped_segments(pid: int) -> set[str]:
+    """Existing files of shared memory that a process has mapped."""
     try:
         lines = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:  # ended meanwhile, or another user's
@@ -192,11 +194,11 @@ def _segments(pid: int) -> set[str]:
 
 
 def _is_mapped(path: str) -> bool:
-    """Whether some process has the segment, one of another program then."""
-    return any(path in _segments(int(entry.name)) for entry in Path("/proc").iterdir() if entry.name.isdecimal())
+    """Whether any process has mapped the segment."""
+    return any(path in _mapped_segments(int(entry.name)) for entry in Path("/proc").iterdir() if entry.name.isdecimal())
 
 
-def _states() -> Iterator[tuple[str, int]]:
+def _process_states() -> Iterator[tuple[str, int]]:
     """State and parent of every OS process."""
     for entry in Path("/proc").iterdir():
         if entry.name.isdecimal():
@@ -208,16 +210,16 @@ def _states() -> Iterator[tuple[str, int]]:
 
 
 @contextmanager
-def _listening(domain: int, found: Soak) -> Iterator[SingleThreadedExecutor]:
-    """A node that hears how far the robot is, and what goes wrong."""
+def _listen(domain: int, found: Soak) -> Iterator[SingleThreadedExecutor]:
+    """A node that collects the robot's progress, and errors of all nodes."""
 
-    def hear_status(message: String) -> None:
+    def add_status(message: String) -> None:
         status = decode(message.data, RobotStatus)
         if status.stamp:
             begin = first.setdefault("stamp", status.stamp)
-            found.scans, found.driven = status.acknowledged, 1e-9 * (status.stamp - begin)
+            found.scans, found.log_seconds = status.acknowledged, 1e-9 * (status.stamp - begin)
 
-    def hear_diagnostics(message: DiagnosticArray) -> None:
+    def add_diagnostics(message: DiagnosticArray) -> None:
         for status in message.status:
             if status.level == DiagnosticStatus.ERROR:
                 found.errors[status.name] = status.message
@@ -236,6 +238,6 @@ def _listening(domain: int, found: Soak) -> Iterator[SingleThreadedExecutor]:
         executor = SingleThreadedExecutor(context=context)
         stack.callback(executor.shutdown)
         executor.add_node(node)
-        node.create_subscription(String, ROBOT_STATUS, hear_status, topics.LATCHED)
-        node.create_subscription(DiagnosticArray, DIAGNOSTICS, hear_diagnostics, topics.STREAM)
+        node.create_subscription(String, ROBOT_STATUS, add_status, topics.LATCHED)
+        node.create_subscription(DiagnosticArray, DIAGNOSTICS, add_diagnostics, topics.STREAM)
         yield executor

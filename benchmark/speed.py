@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from benchmark.logs import ROOT, WITH_RELATIONS, opened
+from benchmark.logs import ROOT, WITH_RELATIONS, open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import Case, Run, Runner
 from benchmark.settings import Settings
@@ -37,37 +37,37 @@ _REPEATS = 5
 Measured = TypeVar("Measured")
 
 POLICY = (
-    "One run at a time, each a process of its own, after one run of every log that compiles what is not in the cache "
-    "and is not counted. CPU time is user and system time of the whole process with all it starts, from its start to "
-    "its exit, with reading the log and writing the folder; memory is the largest resident set. A scan's cost is wall "
-    "time; its mean, its 95 % quantile and its maximum are over all scans of a log, and the mean of the first two and "
-    "the maximum of the third are over the seeds. Start times are medians of five; where other programs keep the "
-    "machine busy, DDS may miss the first announcement of a node, which adds 3 s on the wall."
+    "One run at a time, each an OS process, after one run of every log that compiles missing kernels and does not "
+    "count. CPU time is user and system time of the process and its children, from start to exit, including reading "
+    "the log and writing the folder; memory is the largest resident set. A scan's cost is wall time; its mean, its 95 "
+    "% quantile and its maximum are over all scans of a log. The mean of the first two and the maximum of the third "
+    "are over the seeds. Start times are medians of five; on a busy machine DDS may miss the first announcement of a "
+    "node, which adds 3 s of wall time."
 )
 
 
 def measure_speed(settings: Settings) -> Report:
     """Run every log alone with every seed, and start every program."""
     seeds = settings.seeds_or(SEEDS)
-    report = Report("speed", "What a run costs", seeds=seeds)
+    report = Report("speed", "The cost of a run", seeds=seeds)
     runner = Runner(settings.out / "runs_for_speed", jobs=1)
-    with opened(settings.logs_or(WITH_RELATIONS)) as logs:
+    with open_logs(settings.logs_or(WITH_RELATIONS)) as logs:
         with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder:
             Runner(Path(folder), jobs=1).runs([Case(log, 0, changes=settings.changes) for log in logs])
         runs = {log.name: runner.runs([Case(log, seed, changes=settings.changes) for seed in seeds]) for log in logs}
-    _tell_runs(report, runs)
+    _report_runs(report, runs)
     for name, own in runs.items():
         shutil.copy(plot_cost(own[0].folder), settings.out / f"cost-{name}.png")
         report.pictures[f"cost-{name}.png"] = f"Computing time of every process for every scan of {name}."
-    _tell_starts(report)
+    _report_starts(report)
     report.body.append(POLICY)
     return report
 
 
-def _tell_runs(report: Report, runs: dict[str, list[Run]]) -> None:
+def _report_runs(report: Report, runs: dict[str, list[Run]]) -> None:
     for name, own in runs.items():
         report.requirements += speed_requirements(name, [run.cpu_seconds for run in own], [run.peak_rss for run in own])
-    report.body += [_whole_table(runs), _process_table(runs), *_memory(runs)]
+    report.body += [_whole_table(runs), _process_table(runs), *_memory_tables(runs)]
     report.data["runs"] = {
         name: [
             {"seed": run.case.seed, "cpu_s": run.cpu_seconds, "wall_s": run.wall_seconds, "peak_rss": run.peak_rss}
@@ -79,17 +79,17 @@ def _tell_runs(report: Report, runs: dict[str, list[Run]]) -> None:
 
 
 def speed_requirements(name: str, cpu_seconds: Sequence[float], peak_rss: Sequence[int]) -> list[Requirement]:
-    """What is asked for of the runs of a log; nothing where it has no bound.
+    """Requirements on the runs of a log, none without a bound.
 
     :param cpu_seconds: of each run.
     :param peak_rss: of each run, bytes.
     """
-    asked = []
+    requirements = []
     if name in CPU_BOUNDS:
-        asked.append(Requirement(f"{name}: CPU time", statistics.mean(cpu_seconds), CPU_BOUNDS[name], "s"))
+        requirements.append(Requirement(f"{name}: CPU time", statistics.mean(cpu_seconds), CPU_BOUNDS[name], "s"))
     if name in MEMORY_BOUNDS:
-        asked.append(Requirement(f"{name}: peak memory", max(peak_rss) / 1e6, MEMORY_BOUNDS[name] / 1e6, "MB"))
-    return asked
+        requirements.append(Requirement(f"{name}: peak memory", max(peak_rss) / 1e6, MEMORY_BOUNDS[name] / 1e6, "MB"))
+    return requirements
 
 
 def _whole_table(runs: dict[str, list[Run]]) -> str:
@@ -119,16 +119,16 @@ def _process_table(runs: dict[str, list[Run]]) -> str:
     return table(head, rows)
 
 
-def _memory(runs: dict[str, list[Run]]) -> list[str]:
+def _memory_tables(runs: dict[str, list[Run]]) -> list[str]:
     parts = {name: own[0].report.get("memory_bytes") for name, own in runs.items()}
     rows = [[name, part, f"{size / 1e6:.1f}"] for name, sizes in parts.items() for part, size in (sizes or {}).items()]
     absent = [name for name, sizes in parts.items() if not sizes]
-    told = [table(["log", "part", "memory [MB]"], rows)] if rows else []
-    return told + ([f"The reports of {', '.join(absent)} do not tell memory by part."] if absent else [])
+    tables = [table(["log", "part", "memory [MB]"], rows)] if rows else []
+    return tables + ([f"The reports of {', '.join(absent)} have no memory by part."] if absent else [])
 
 
-def _tell_starts(report: Report) -> None:
-    rows = [["`hmt_slam --help`", f"{statistics.median(_repeated(_seconds_of_help)):.2f}", ""]]
+def _report_starts(report: Report) -> None:
+    rows = [["`hmt_slam --help`", f"{statistics.median(_repeat(_seconds_of_help)):.2f}", ""]]
     if importlib.util.find_spec("rclpy") is None:
         report.body.append("There is no ROS here: the start of the nodes is not measured. Run scripts/test.sh first.")
     else:
@@ -143,19 +143,19 @@ def _seconds_of_help() -> float:
 
 
 def _node_starts(report: Report) -> list[list[str]]:
-    from benchmark.running_nodes import NODES, until_answer, until_first_pose  # noqa: PLC0415  only where there is ROS
+    from benchmark.running_nodes import NODES, time_until_answer, time_until_first_pose  # noqa: PLC0415  only where there is ROS
 
-    starts = {f"node {name}, until it answers": _repeated(partial(until_answer, name)) for name in NODES}
+    starts = {f"node {name}, until it answers": _repeat(partial(time_until_answer, name)) for name in NODES}
     wall = {name: statistics.median(start.wall for start in measured) for name, measured in starts.items()}
     slowest = max(wall, key=lambda name: wall[name])
     report.requirements.append(Requirement(f"start: {slowest}", wall[slowest], START_BOUND, "s"))
-    starts["node slam, until the first pose"] = _repeated(until_first_pose)
+    starts["node slam, until the first pose"] = _repeat(time_until_first_pose)
     report.data["start_s"] = {name: [start._asdict() for start in measured] for name, measured in starts.items()}
     medians = {name: np.median(np.array(measured), axis=0) for name, measured in starts.items()}
     return [[name, f"{wall_seconds:.2f}", f"{cpu:.2f}"] for name, (wall_seconds, cpu) in medians.items()]
 
 
-def _repeated(measure: Callable[[], Measured]) -> list[Measured]:
-    """A few repetitions, after one that is not counted."""
+def _repeat(measure: Callable[[], Measured]) -> list[Measured]:
+    """Some repetitions, after one that does not count."""
     measure()
     return [measure() for _ in range(_REPEATS)]

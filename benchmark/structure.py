@@ -1,4 +1,4 @@
-"""How large the package is, and how many files one scan, one keyframe and one closure pass.
+"""The size of the package, and the number of files that a scan, a keyframe and a closure pass.
 
 A function call or a return that leads from one file of the package to another is a move. The bundled log is run in
 lock-step; the figures of a scan are the median over those without a keyframe event, those of a keyframe the median over
@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
-from benchmark.logs import BUNDLED, opened
+from benchmark.logs import BUNDLED, open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
@@ -30,11 +30,11 @@ LONGEST, MOST_LINES = 600, 36_000
 """Lines of a file, and of the package, at most."""
 
 MOST_FILES = {"scan": 14, "keyframe": 35, "closure": 50}
-"""Files that are passed, as aimed at."""
+"""Largest numbers of files that are passed."""
 
 
 class Passage(NamedTuple):
-    """What one record of the log passed.
+    """The files that a record of the log passes.
 
     :ivar kind: "scan", "keyframe" or "closure".
     :ivar files: of the package that were entered.
@@ -48,14 +48,14 @@ class Passage(NamedTuple):
 
 def measure_structure(settings: Settings) -> Report:
     """Count files, lines and classes, and follow the bundled log through them."""
-    report = Report("structure", "The size of the package, and the way of a scan through it", seeds=(0,))
+    report = Report("structure", "The size of the package, and the path of a scan through it", seeds=(0,))
     paths = sorted(PACKAGE.rglob("*.py"))
     lines = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in paths}
     classes = Counter(name for path in paths for name in class_names(path))
     homonyms = sorted(name for name, count in classes.items() if count > 1)
-    with opened([BUNDLED]) as (log,):
-        passages = list(followed(log.path, settings.changes))
-    figures = {kind: typical(passages, kind) for kind in MOST_FILES}
+    with open_logs([BUNDLED]) as (log,):
+        passages = list(follow_log(log.path, settings.changes))
+    figures = {kind: typical_passage(passages, kind) for kind in MOST_FILES}
     report.requirements = [
         Requirement("lines of the package", sum(lines.values()), MOST_LINES),
         Requirement("lines of the longest file", max(lines.values()), LONGEST),
@@ -64,10 +64,13 @@ def measure_structure(settings: Settings) -> Report:
     ]
     report.body = [
         table(["modules", "lines", "classes"], [[str(len(paths)), str(sum(lines.values())), str(classes.total())]]),
-        table(["of one", "files", "moves"], [[kind, str(one.files), str(one.moves)] for kind, one in figures.items()]),
+        table(
+            ["of one", "files", "moves"],
+            [[kind, str(passage.files), str(passage.moves)] for kind, passage in figures.items()],
+        ),
         f"Several meanings: {', '.join(homonyms) or 'none'}.",
     ]
-    report.data = {kind: one._asdict() for kind, one in figures.items()}
+    report.data = {kind: passage._asdict() for kind, passage in figures.items()}
     return report
 
 
@@ -78,16 +81,16 @@ def class_names(path: Path) -> Iterator[str]:
             yield node.name.lstrip("_")
 
 
-def typical(passages: list[Passage], kind: str) -> Passage:
+def typical_passage(passages: list[Passage], kind: str) -> Passage:
     """The median of a kind's passages; of closures, the largest."""
-    own = [one for one in passages if one.kind == kind]
+    own = [passage for passage in passages if passage.kind == kind]
     over: Callable[[list[int]], float] = max if kind == "closure" else statistics.median
-    files, moves = ([getattr(one, name) for one in own] or [0] for name in ("files", "moves"))
+    files, moves = ([getattr(passage, name) for passage in own] or [0] for name in ("files", "moves"))
     return Passage(kind, round(over(files)), round(over(moves)))
 
 
-def followed(path: Path, changes: tuple[str, ...]) -> Iterator[Passage]:
-    """What each scan of a log passes; those before the first keyframe events are left out."""
+def follow_log(path: Path, changes: tuple[str, ...]) -> Iterator[Passage]:
+    """The passage of each scan of a log after the first keyframe event."""
     run = LockStepRun(load_configuration(PARAMETERS, list(changes)))
     recorder = run.recorder
     scans, events, closures = 0, 0, 0

@@ -1,4 +1,4 @@
-"""The paper's Table II: time and memory against the same program with one area for everything, at equal accuracy."""
+"""The paper's Table II: time and memory against the same program with a single area, at equal accuracy."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from matplotlib.figure import Figure
 
 from benchmark import charted_run
 from benchmark.charted_run import AREAS, METRIC
-from benchmark.logs import BUNDLED, MeasuredLog, datasets, opened
+from benchmark.logs import BUNDLED, MeasuredLog, dataset_folder, open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.robustness import LONG_LIMIT
 from benchmark.runs import PARAMETERS, Case, Run, Runner
 from benchmark.scoring import FINAL
 from benchmark.settings import Settings
-from benchmark.simulated.records import code
+from benchmark.simulated.records import code_hash
 from benchmark.simulated.worlds import CAMPUS, CAMPUS_WORLD
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import (
@@ -43,32 +43,31 @@ from hmt_slam_ros.simulation import open_simulated
 COMPARED = ("edmonton", CAMPUS, "aces")
 
 PARTICLES = (12, 100)
-"""Of the metric filter; more are tried until it is as accurate, but 1000 take more than an hour on the campus."""
+"""Numbers of particles of the metric filter, which are tried in this order until it is as accurate."""
 
 FACTOR, SLACK = 1.25, 0.01
-"""An error is as good as another up to this factor, and up to so many m more."""
+"""Largest ratio and largest difference (m) of errors that are as good as each other."""
 
 MEMORY, TIME = 3.0, 4.0
-"""How many times as much the metric filter takes on the campus, at least."""
+"""Smallest ratios of memory and time of the metric filter on the campus."""
 
 SEEDS = 1
 
 POLICY = (
-    "HMT-SLAM is the program as it is. The metric RBPF is the same program with one area for everything: its local map "
-    "holds the whole log, area abstraction never cuts, so that no topological process has anything to do, and a loop "
-    f"is closed by particles alone. It is tried with {', '.join(map(str, PARTICLES))} particles, until its final "
-    f"trajectory is as accurate over relations of more than 60 s: up to {FACTOR:g} times the error, or {SLACK:g} m "
-    f"more, and no error above {LONG_LIMIT:g} m, beyond which a map is not right. Where none is, its figures with the "
-    "most particles are lower bounds of what it would take. One run at a time, each a process of its own, kernels "
-    "compiled before. CPU time is user and system time of the process without what reading or simulating the log "
-    "took; peak memory is the largest resident set, of which some is there before the first scan. Both runs "
-    "end with the same refinement of the trajectory, which is told, and is part of both figures. The campus is "
-    f"{CAMPUS_WORLD}, judged by the truth; ACES by its relations; Edmonton, which has no truth, by how far relations "
-    "of the trajectory are from GMapping's, which is a metric RBPF as well."
+    "HMT-SLAM is the program as it is. The metric RBPF is the same program with a single area: its local map contains "
+    "the whole log, and area abstraction never cuts. So the topological processes have nothing to do, and loops are "
+    f"closed by particles alone. It runs with {', '.join(map(str, PARTICLES))} particles, until its final trajectory "
+    f"is as accurate over relations of more than 60 s: up to {FACTOR:g} times the error, or {SLACK:g} m more, and no "
+    f"error above {LONG_LIMIT:g} m, beyond which a map is not right. If none is, its figures with the most particles "
+    "are lower bounds. One run at a time, each an OS process, with compiled kernels. CPU time is user and system time "
+    "of the process without reading or simulating the log; peak memory is the largest resident set, which includes the "
+    "memory before the first scan. Both runs end with the same refinement of the trajectory, which is listed, and part "
+    f"of both figures. The campus is {CAMPUS_WORLD}, scored by the truth; ACES by its relations; Edmonton, which has "
+    "no truth, by the distance of its relations from those of GMapping, which is a metric RBPF as well."
 )
 
 EXTENTS = {"edmonton": 100.0, CAMPUS: 200.0, "aces": 80.0}
-"""Half side of the one map of a log, m, that holds all of it."""
+"""Half of the side of a map that contains the whole log, m."""
 
 _GMAPPING = "edmonton.gmapping.txt.xz"
 _DPI = 80
@@ -98,51 +97,51 @@ class Entry:
     worst: float
 
     def as_accurate_as(self, other: Entry) -> bool:
-        """Whether its long error is as good, and its map right."""
+        """Whether the long error is as good, and the map right."""
         return self.worst <= LONG_LIMIT and self.long_error <= max(FACTOR * other.long_error, other.long_error + SLACK)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """All that was tried on a log.
+    """The entries of a log.
 
     :ivar ours: the program as it is.
-    :ivar metric: one area for everything, with more and more particles.
+    :ivar metric: the program with a single area, with increasing numbers of particles.
     :ivar runs: {method: its run with the first seed}.
-    :ivar judge: what the errors are from.
+    :ivar reference_name: name of the reference of the errors.
     """
 
     ours: Entry
     metric: tuple[Entry, ...]
     runs: dict[str, Run]
-    judge: str
+    reference_name: str
 
     @property
-    def equal(self) -> bool:
+    def is_equal(self) -> bool:
         """Whether the last metric filter is as accurate."""
         return self.metric[-1].as_accurate_as(self.ours)
 
     @property
-    def memory(self) -> float:
-        """How many times as much memory the last metric filter takes."""
+    def memory_ratio(self) -> float:
+        """Ratio of the memory of the last metric filter."""
         return self.metric[-1].peak / self.ours.peak
 
     @property
-    def time(self) -> float:
-        """Likewise CPU time."""
+    def time_ratio(self) -> float:
+        """Ratio of the CPU time of the last metric filter."""
         return self.metric[-1].cpu / self.ours.cpu
 
 
 def measure_table(settings: Settings) -> Report:
-    """Map every log both ways."""
+    """Map every log with both programs."""
     names, seeds = settings.logs_or(COMPARED), settings.seeds_or(SEEDS)
     if strange := [name for name in names if name not in EXTENTS]:
         raise HmtSlamError(f"there is no {strange[0]!r} to compare on: choose from {', '.join(EXTENTS)}")
     report = Report("table", "Time and memory against a global metric RBPF", seeds=seeds)
-    runner = KeptRunner(settings.records.folder / "table", jobs=1)
-    with compared(names) as logs:
-        _compile()
-        found = {log.name: _compared(log, seeds, settings.changes, runner) for log in logs}
+    runner = CachedRunner(settings.records.folder / "table", jobs=1)
+    with open_compared_logs(names) as logs:
+        _compile_kernels()
+        found = {log.name: _compare_log(log, seeds, settings.changes, runner) for log in logs}
     if CAMPUS in found:
         report.requirements += requirements(found[CAMPUS])
     processes = {name: own.runs["HMT-SLAM"].report["ms_per_scan"] for name, own in found.items()}
@@ -159,18 +158,18 @@ def measure_table(settings: Settings) -> Report:
     return report
 
 
-def _compile() -> None:
-    """One run that is not counted, for the kernels that are not in the cache."""
-    with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder, opened([BUNDLED]) as (log,):
-        Runner(Path(folder), jobs=1).runs([Charted(log, 0, way=AREAS)])
+def _compile_kernels() -> None:
+    """Compile missing kernels in a run that does not count."""
+    with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder, open_logs([BUNDLED]) as (log,):
+        Runner(Path(folder), jobs=1).runs([ChartedCase(log, 0, variant=AREAS)])
 
 
-def _compared(log: MeasuredLog, seeds: Sequence[int], changes: tuple[str, ...], runner: Runner) -> Comparison:
-    own = runner.runs([Charted(log, seed, changes=changes, way=AREAS) for seed in seeds])
-    relations, judge = reference_of(log, own[0])
+def _compare_log(log: MeasuredLog, seeds: Sequence[int], changes: tuple[str, ...], runner: Runner) -> Comparison:
+    own = runner.runs([ChartedCase(log, seed, changes=changes, variant=AREAS) for seed in seeds])
+    relations, reference_name = choose_reference(log, own[0])
 
     def entry(method: str, particles: int, runs: Sequence[Run]) -> Entry:
-        errors = [judged(run, relations) for run in runs]
+        errors = [score_run(run, relations) for run in runs]
         return Entry(
             method,
             particles,
@@ -194,23 +193,23 @@ def _compared(log: MeasuredLog, seeds: Sequence[int], changes: tuple[str, ...], 
         kept[f"metric RBPF, {particles} particles"] = runs[0]
         if metric[-1].as_accurate_as(ours):
             break
-    return Comparison(ours, tuple(metric), kept, judge)
+    return Comparison(ours, tuple(metric), kept, reference_name)
 
 
 def requirements(campus: Comparison) -> list[Requirement]:
-    """What is asked for on the campus."""
+    """Requirements on the campus."""
     last = campus.metric[-1]
-    how = "as accurate" if campus.equal else "not as accurate"
-    of = f"metric RBPF of {last.particles} particles, {how}, against HMT-SLAM on the campus"
+    accuracy = "as accurate" if campus.is_equal else "not as accurate"
+    subject = f"metric RBPF of {last.particles} particles, {accuracy}, against HMT-SLAM on the campus"
     return [
         Requirement("largest error of HMT-SLAM on the campus, over 60 s", campus.ours.worst, LONG_LIMIT, "m"),
-        Requirement(f"memory of the {of}", campus.memory, float("inf"), "times", least=MEMORY),
-        Requirement(f"CPU time of the {of}", campus.time, float("inf"), "times", least=TIME),
+        Requirement(f"memory of the {subject}", campus.memory_ratio, float("inf"), "times", least=MEMORY),
+        Requirement(f"CPU time of the {subject}", campus.time_ratio, float("inf"), "times", least=TIME),
     ]
 
 
 def comparison_table(found: dict[str, Comparison]) -> str:
-    """One line for every method on every log."""
+    """A table with a line for every method on every log."""
     head = ["log", "method", "particles", "areas", "loop closures", "CPU time [s]", "of it refinement"]
     head += ["peak memory [MB]", "of it before the first scan", "maps of the particles [MB]", "error [m]"]
     head += ["over 60 s [m]", "the largest [m]", "by", "as accurate"]
@@ -221,7 +220,9 @@ def comparison_table(found: dict[str, Comparison]) -> str:
             costs = [f"{cost:.0f}" for cost in (entry.cpu, entry.refinement, entry.peak, entry.start, entry.maps)]
             same = "yes" if entry.as_accurate_as(own.ours) else "no"
             errors = [f"{error:.3f}" for error in (entry.error, entry.long_error, entry.worst)]
-            rows.append([name, entry.method, *counts, *costs, *errors, own.judge, "" if entry is own.ours else same])
+            rows.append(
+                [name, entry.method, *counts, *costs, *errors, own.reference_name, "" if entry is own.ours else same]
+            )
     return table(head, rows)
 
 
@@ -232,8 +233,8 @@ def _ratio_table(found: dict[str, Comparison]) -> str:
     for name, own in found.items():
         last, ours = own.metric[-1], own.ours
         grown = (last.peak - last.start) / (ours.peak - ours.start)
-        ratios = [f"{ratio:.2f}" for ratio in (own.memory, grown, last.maps / ours.maps, own.time)]
-        rows.append([name, str(last.particles), "yes" if own.equal else "no", *ratios])
+        ratios = [f"{ratio:.2f}" for ratio in (own.memory_ratio, grown, last.maps / ours.maps, own.time_ratio)]
+        rows.append([name, str(last.particles), "yes" if own.is_equal else "no", *ratios])
     return table(head, rows)
 
 
@@ -244,85 +245,85 @@ def _process_table(processes: dict[str, dict[str, float]]) -> str:
 
 
 @dataclass(frozen=True)
-class Charted(Case):
-    """A run whose cost is told as it goes on.
+class ChartedCase(Case):
+    """A run with the cost over time.
 
-    :ivar way: "areas" or "metric", see :mod:`benchmark.charted_run`.
+    :ivar variant: "areas" or "metric", see :mod:`benchmark.charted_run`.
     """
 
-    way: str = ""
+    variant: str = ""
 
     @property
     def name(self) -> str:
         """Of the output folder."""
-        return f"{self.way}-{super().name}"
+        return f"{self.variant}-{super().name}"
 
     def command(self, folder: Path) -> list[str]:
         """The command line that maps the log into a folder."""
         options = ["--out", str(folder), "--seed", str(self.seed), "--config", str(PARAMETERS)]
         changes = [word for change in self.changes for word in ("--set", change)]
-        return [sys.executable, "-m", "benchmark.charted_run", self.way, str(self.log.path), *options, *changes]
+        return [sys.executable, "-m", "benchmark.charted_run", self.variant, str(self.log.path), *options, *changes]
 
 
-def metric_case(log: MeasuredLog, seed: int, changes: tuple[str, ...], particles: int) -> Charted:
-    """One area for everything, with so many particles."""
+def metric_case(log: MeasuredLog, seed: int, changes: tuple[str, ...], particles: int) -> ChartedCase:
+    """The case with a single area, and a number of particles."""
     own = (f"local_map.extent={EXTENTS[log.name]:g}", f"filter.particles={particles}")
-    return Charted(log, seed, changes=(*changes, *own), way=METRIC)
+    return ChartedCase(log, seed, changes=(*changes, *own), variant=METRIC)
 
 
-class KeptRunner(Runner):
-    """Runs that stay in their folder, and are made anew only for another program or other parameters."""
+class CachedRunner(Runner):
+    """A runner that keeps runs in their folder, for the same program and parameters."""
 
     def _run(self, case: Case) -> Run:
         folder = self.folder.absolute() / case.name
-        kept = folder / "usage.json"
-        if kept.is_file():
-            usage: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
-            if usage.pop("code") == _code():
+        usage_file = folder / "usage.json"
+        if usage_file.is_file():
+            usage: dict[str, Any] = json.loads(usage_file.read_text(encoding="utf-8"))
+            if usage.pop("code") == _fingerprint():
                 return Run(case, folder, **usage)
         shutil.rmtree(folder, ignore_errors=True)
         run = super()._run(case)
         if not run.fault:
             usage = {"cpu_seconds": run.cpu_seconds, "wall_seconds": run.wall_seconds, "peak_rss": run.peak_rss}
-            kept.write_text(json.dumps(usage | {"code": _code()}), encoding="utf-8")
+            usage_file.write_text(json.dumps(usage | {"code": _fingerprint()}), encoding="utf-8")
         return run
 
 
-def _code() -> str:
-    """What the runs of this code are known by."""
-    return code() + hashlib.sha256(Path(charted_run.__file__).read_bytes()).hexdigest()[:8]
+def _fingerprint() -> str:
+    """A hash of the code, which identifies its runs."""
+    return code_hash() + hashlib.sha256(Path(charted_run.__file__).read_bytes()).hexdigest()[:8]
 
 
 @contextmanager
-def compared(names: Sequence[str]) -> Iterator[list[MeasuredLog]]:
-    """The logs of some names, the campus among them.
+def open_compared_logs(names: Sequence[str]) -> Iterator[list[MeasuredLog]]:
+    """The logs of some names, including the campus.
 
-    :raises HmtSlamError: for a name that is none, or a file that is not there.
+    :raises HmtSlamError: for an unknown name or a missing file.
     """
-    with opened([name for name in names if name != CAMPUS]) as logs:
+    with open_logs([name for name in names if name != CAMPUS]) as logs:
         by_name = {log.name: log for log in logs} | {CAMPUS: MeasuredLog(CAMPUS, Path(CAMPUS_WORLD))}
         yield [by_name[name] for name in names]
 
 
-def reference_of(log: MeasuredLog, run: Run) -> tuple[Relations, str]:
-    """Relations by which the trajectories of a log are judged, and where they are from.
+def choose_reference(log: MeasuredLog, run: Run) -> tuple[Relations, str]:
+    """Relations for the trajectories of a log, and the name of their source.
 
-    :param run: of the program as it is, by which the others are judged where nothing else is known.
+    :param run: of the program as it is, which is the reference if there is no other.
     """
     if log.name == CAMPUS:
         return true_relations(read_true_poses(open_simulated(CAMPUS_WORLD))), "truth"
     if log.relations is not None:
         return log.relations, "relations"
-    file = datasets() / _GMAPPING
+    file = dataset_folder() / _GMAPPING
     if log.name in file.name and file.is_file():
-        with lzma.open(file, "rt", encoding="utf-8") as lines:
-            rows = np.loadtxt(lines)
+        with lzma.open(file, "rt", encoding="utf-8") as source:
+            rows = np.loadtxt(source)
         stamps = np.round(1e9 * rows[:, 0]).astype(np.int64)
         return true_relations(StampedPoses(stamps, rows[:, 1:4])), "GMapping"
     return true_relations(read_tum(run.folder / FINAL)), "the other run"
 
 
-def judged(run: Run, relations: Relations) -> RelationErrors:
+def score_run(run: Run, relations: Relations) -> RelationErrors:
     """Errors of a run's trajectory."""
     log = run.case.log
     odometry = None if log.name == CAMPUS else log.odometry
@@ -330,7 +331,7 @@ def judged(run: Run, relations: Relations) -> RelationErrors:
 
 
 def plot_growth(path: Path, logs: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> None:
-    """Memory above that before the first scan, and time for a scan, over the log; as Fig. 9e of the paper.
+    """Draw memory above that before the first scan, and time of a scan, over the log, as Fig. 9e of the paper.
 
     :param logs: {log: {method: report of :mod:`benchmark.charted_run`}}.
     """
@@ -343,18 +344,15 @@ def plot_growth(path: Path, logs: Mapping[str, Mapping[str, Mapping[str, Any]]])
             minutes = [sample["s"] / 60.0 for sample in memory]
             upper.plot(minutes, [(s["bytes"] - memory[0]["bytes"]) / 1e6 for s in memory], label=method)
             lower.plot([sample["s"] / 60.0 for sample in cost], [sample["ms"] for sample in cost], linewidth=0.8)
-        upper.set_title(name)
-        upper.set_ylabel("memory [MB]")
+        upper.set(title=name, ylabel="memory [MB]")
         upper.set_ylim(bottom=0.0)
         upper.legend(fontsize=7)
-        lower.set_yscale("log")
-        lower.set_ylabel("computing time of a scan [ms]")
-        lower.set_xlabel("time of the log [min]")
+        lower.set(yscale="log", ylabel="computing time of a scan [ms]", xlabel="time of the log [min]")
     figure.savefig(path, dpi=_DPI)
 
 
 def plot_processes(path: Path, logs: Mapping[str, Mapping[str, float]]) -> None:
-    """Mean time of every process for a scan; as Fig. 9c of the paper.
+    """Draw the mean time of every process for a scan, as Fig. 9c of the paper.
 
     :param logs: {log: {process: ms}}.
     """
@@ -366,7 +364,6 @@ def plot_processes(path: Path, logs: Mapping[str, Mapping[str, float]]) -> None:
         places = np.arange(len(processes)) + (k - 0.5 * (len(logs) - 1)) * width
         axes.bar(places, [own[process] for process in processes], width, label=name)
     axes.set_xticks(range(len(processes)), processes)
-    axes.set_yscale("log")
-    axes.set_ylabel("mean time for a scan [ms]")
+    axes.set(yscale="log", ylabel="mean time for a scan [ms]")
     axes.legend(fontsize=7)
     figure.savefig(path, dpi=_DPI)

@@ -153,20 +153,20 @@ class Page:
         self.browser, self._listener, self._nodes = browser, listener, nodes
 
     def until(self, condition):
-        """Wait for it; the page is asked a few times a second."""
-        asked = 0.0
+        """Wait for it; the page is polled a few times a second."""
+        requested = 0.0
 
         def due():
-            nonlocal asked
-            if time.monotonic() - asked < 0.3:
+            nonlocal requested
+            if time.monotonic() - requested < 0.3:
                 return False
-            asked = time.monotonic()
+            requested = time.monotonic()
             return condition()
 
         self._listener.until(due, seconds=120.0, alive=self._nodes)
 
     @property
-    def drawn(self):
+    def drawing(self):
         return json.loads(self.browser.evaluate("document.getElementById('plan').dataset.drawn ?? '{}'"))
 
     def text(self, name):
@@ -184,7 +184,7 @@ class Page:
             self.browser.send("Input.dispatchTouchEvent", type=kind, touchPoints=points)
         self.browser.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
-    def colours(self, canvas):
+    def colors(self, canvas):
         """How many different ones there are on a canvas."""
         return self.browser.evaluate(
             f"""(() => {{

@@ -29,7 +29,7 @@ NODES = ("test_ros_", "test_view_page", "test_package_compilation")  # files in 
 def pytest_xdist_make_scheduler(config, log):
     """One worker takes the files in which nodes run, the others what only computes, until nothing else is left.
 
-    Nodes wait for each other, and are told to do things within a time; six of them at once are enough for two cores.
+    Nodes wait for each other, and have to react within a time; six of them at once are enough for two cores.
     """
     from xdist.scheduler import LoadFileScheduling  # noqa: PLC0415  only where it is installed
 
@@ -58,7 +58,7 @@ def domain(monkeypatch):
 
 
 class Listener:
-    """A node of the test's own, and what it heard."""
+    """A node of the test's own, and what it received."""
 
     def __init__(self, domain):
         from rclpy.context import Context  # noqa: PLC0415  only where there is ROS
@@ -71,11 +71,11 @@ class Listener:
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
 
-    def hear(self, kind, topic, profile):
+    def subscribe(self, kind, topic, profile):
         """Subscribe; the list that is returned fills up."""
-        heard = []
-        self.node.create_subscription(kind, topic, heard.append, profile)
-        return heard
+        received = []
+        self.node.create_subscription(kind, topic, received.append, profile)
+        return received
 
     def until(self, condition, seconds=WAIT, alive=()):
         """Spin until a condition holds; fail where it does not, or where one of the processes ends before."""
@@ -120,7 +120,7 @@ def listener(domain):
 def start(domain):
     """Starts nodes as OS processes, behind words such as of a command that runs them elsewhere.
 
-    At the end, each that is left has to end well when told to.
+    At the end, each that is left has to end well on request.
     """
     started = []
 

@@ -8,7 +8,7 @@ from hmt_slam_ros.simulation.building import FloorPlan
 from hmt_slam_ros.simulation.scenario import START
 
 ROOM = (4.0, 3.5)
-"""Where the robot was in the room of the first door; the last keyframe is up to half a metre before."""
+"""Where the robot was in the room of the first door; the last keyframe is up to half a meter before."""
 
 
 def write_world(folder):
@@ -26,7 +26,7 @@ def write_world(folder):
     return f"sim:{path}"
 
 
-def scripted(world):
+def scripted_drive(world):
     """Seconds from the beginning of its drive, shape (n,), and where the robot is then, (n, 3)."""
     log = open_simulated(world)
     seconds = np.arange(0.0, log.duration, 0.1)
@@ -35,5 +35,5 @@ def scripted(world):
 
 def in_hallway(world, x):
     """Seconds from the beginning until the robot is so far along the hallway, m."""
-    seconds, poses = scripted(world)
+    seconds, poses = scripted_drive(world)
     return float(seconds[poses[:, 0] >= x][-1])

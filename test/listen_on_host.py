@@ -1,4 +1,4 @@
-"""Beside the five processes on their host: hear all estimates, have the map saved, say what every node said last.
+"""Beside the five processes on their host: receive all estimates, save the map, print the last status of each node.
 
 A process of its own, as Fast DDS knows the network of the first participant of a process for all that follow.
 """
@@ -20,18 +20,18 @@ PATIENCE = 240.0  # s
 def main(domain, scans):
     """Exit with a sentence where the map is not saved."""
     listener = Listener(domain)
-    estimates = listener.hear(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
-    health = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    estimates = listener.subscribe(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
+    health = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     print("listens", flush=True)
     try:
-        # What is lost may be asked for again after three seconds only, by Fast DDS's heartbeat.
+        # What is lost may be requested again after three seconds only, by Fast DDS's heartbeat.
         listener.until(lambda: len(estimates) == scans, seconds=PATIENCE)
         answer = listener.call(Trigger, "slam/save", Trigger.Request())
     finally:
         print(f"{len(estimates)} of {scans} estimates came")
         for status in {message.status[0].name: message.status[0] for message in health}.values():
-            said = ", ".join(f"{entry.key} {entry.value}" for entry in status.values)
-            print(f"{status.name}: {status.message}; {said}")
+            messages = ", ".join(f"{entry.key} {entry.value}" for entry in status.values)
+            print(f"{status.name}: {status.message}; {messages}")
         listener.close()
     if not answer.success:
         sys.exit(answer.message)

@@ -22,7 +22,7 @@ WALLS = np.concatenate([box(-3, -3, 12, 3), box(4, 1, 5, 3)])
 class Corridor:
     """Scans every 0.2 s, four odometry readings to each, at 0.5 m/s; a scan's sweep takes ``sweep`` s.
 
-    Before the scan of a number the robot is carried as far along its way as it goes in so many scans, ``carried``.
+    Before the scan of a number the robot is kidnapped along its route, by the path of ``carried`` scans.
     While the laser is ``silent``, from one scan to before another, only odometry comes.
     """
 

@@ -36,7 +36,7 @@ def reason_against():
     try:
         with LossyLink(0.0, 0.0, 0.0) as link:
             for number in range(2):
-                subprocess.run([*link.on(number), "true"], check=True, capture_output=True)
+                subprocess.run([*link.host_command(number), "true"], check=True, capture_output=True)
     except subprocess.CalledProcessError as fault:
         return f"two network namespaces are not permitted here: {fault.stderr.decode().strip()}"
     return ""
@@ -76,14 +76,14 @@ class LossyLink:
     def __exit__(self, *_fault):
         self._end.close()
 
-    def on(self, number):
+    def host_command(self, number):
         """The beginning of a command that runs on one of the hosts, of which the second shares this one's memory."""
         apart = ["sh", "-c", 'mount -t tmpfs tmpfs /dev/shm && exec "$@"', "sh"]
         return ["ip", "netns", "exec", self.hosts[number], *([] if number else apart)]
 
 
 def _end(link):
-    """End the program that is the link, and print how many packets it carried."""
+    """End the program that is the link, and print how many packets it forwarded."""
     link.terminate()
     print(link.communicate()[0])
 
@@ -114,7 +114,7 @@ def _device(host):
 
 
 def carry(hosts, delay, jitter, loss):
-    """Carry packets between the hosts for ever."""
+    """Forward packets between the hosts for ever."""
     ends = [_device(host) for host in hosts]
     lost, number = 0, 0
 

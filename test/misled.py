@@ -18,7 +18,7 @@ from hmt_slam_ros.topological_inference.tsbi import Tsbi
 SIGMA = np.diag([0.05, 0.05, np.radians(0.5)]) ** 2
 
 
-def misled(area, known, deviations):
+def make_misled(area, known, deviations):
     """What makes the children of hypotheses, once falsely: from ``area`` a loop is closed to ``known``.
 
     :param deviations: by how many deviations of what the arcs say of it the place is wrong, in its worst direction.

@@ -23,7 +23,7 @@ def belief(pose, spread=SPREAD):
 
 
 class Play:
-    """TLCA with slam and TSBI played: keyframes are stored where the leaves say, one after another."""
+    """TLCA with slam and TSBI played: keyframes are stored where the hypotheses are, one after another."""
 
     def __init__(self, refinement=0, **changes):
         options = {"accept_keyframes": 3, "accept_distance": 1.0, "accept_probability": 0.9} | changes
@@ -32,8 +32,8 @@ class Play:
         self.k = -1
         self.notices = []
 
-    def step(self, *leaves, places=None, world=HOME, travelled=None):
-        """One keyframe event: ``places`` are (hypothesis, area, area_T_base) before it, ``leaves`` TSBI's answer.
+    def step(self, *hypotheses, places=None, world=HOME, traveled=None):
+        """One keyframe event: ``places`` are (hypothesis, area, area_T_base) before it, ``hypotheses`` TSBI's answer.
 
         Without places the keyframe is at the origin of the robot's area, and is the first of an area that is new.
         """
@@ -41,24 +41,24 @@ class Play:
         if places is None:
             replica = self.process._replica
             places = [(h, area, np.zeros(3)) for h, area in replica.robot_areas.items()]
-            leaves = [self._with_first_keyframe(leaf, replica) for leaf in leaves]
+            hypotheses = [self._with_first_keyframe(child, replica) for child in hypotheses]
         estimates = tuple(
             HypothesisEstimate(h, area, belief(pose), True, 0.0, 0.0, Clutter(), 12.0) for h, area, pose in places
         )
-        travelled = 0.5 * self.k if travelled is None else travelled
-        assert self.process.handle(Keyframe(self.k, worlds.scan_at(WORLD, world), travelled, estimates)) == []
-        said = self.process.handle(Hypotheses(self.k, tuple(leaves) or (Hypothesis(0, 0, 1.0, 0),)))
-        verdicts = [message for message in said if isinstance(message, ClosureDecision)]
-        self.notices += [message for message in said if isinstance(message, Notice)]
+        traveled = 0.5 * self.k if traveled is None else traveled
+        assert self.process.handle(Keyframe(self.k, worlds.scan_at(WORLD, world), traveled, estimates)) == []
+        messages = self.process.handle(Hypotheses(self.k, tuple(hypotheses) or (Hypothesis(0, 0, 1.0, 0),)))
+        verdicts = [message for message in messages if isinstance(message, ClosureDecision)]
+        self.notices += [message for message in messages if isinstance(message, Notice)]
         assert len(verdicts) == 1
         assert verdicts[0].sequence == self.k
         return verdicts[0]
 
-    def _with_first_keyframe(self, leaf, replica):
-        if leaf.moved_keyframes or leaf.area in (0, *replica.maps[leaf.parent].area_ids()):
-            return leaf
+    def _with_first_keyframe(self, child, replica):
+        if child.moved_keyframes or child.area in (0, *replica.maps[child.parent].area_ids()):
+            return child
         return replace(
-            leaf, moved_keyframes=(MovedKeyframe(self.k, replica.robot_areas[leaf.parent], leaf.area, np.zeros(3)),)
+            child, moved_keyframes=(MovedKeyframe(self.k, replica.robot_areas[child.parent], child.area, np.zeros(3)),)
         )
 
     def start(self):
@@ -69,7 +69,7 @@ class Play:
 
 
 def new_area(hypothesis, parent, probability, area, pose, source=0):
-    """A leaf whose newest keyframe leaves ``source`` for the new ``area`` at ``source_T_area``."""
+    """A hypothesis whose newest keyframe leaves ``source`` for the new ``area`` at ``source_T_area``."""
     arc = Arc(source, area, belief(pose))
     return Hypothesis(hypothesis, parent, probability, area, belief(se2.inverse(pose)), (), (arc,))
 

@@ -13,7 +13,7 @@ LOOK = 0.2  # s
 
 
 class Recording:
-    """Subscribes to every topic as soon as somebody publishes it, and keeps the bytes that come.
+    """Subscribes to every topic as soon as it has a publisher, and keeps the bytes that come.
 
     :ivar counts: messages of each topic, {topic: count}; that they can be read by others is seen to as they come.
     :ivar offered: {topic: (type, profiles of the publishers)}.
@@ -32,9 +32,9 @@ class Recording:
             if topic not in self._subscriptions and offers:
                 assert not others, topic
                 self.offered[topic] = kind, offers
-                self._subscriptions[topic] = self._subscribed(topic, kind, offers)
+                self._subscriptions[topic] = self._subscribe(topic, kind, offers)
 
-    def _subscribed(self, topic, kind, offers):
+    def _subscribe(self, topic, kind, offers):
         connection = self._writer.add_connection(topic, kind, typestore=typestore())
 
         def keep(content):
@@ -55,7 +55,7 @@ class Recording:
 
 
 def what_all_offer(offers):
-    """The profile that rosbag2 asks for."""
+    """The profile that rosbag2 requests."""
     reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
     latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
     return QoSProfile(

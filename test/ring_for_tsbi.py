@@ -40,7 +40,7 @@ STEP = np.diag([0.02, 0.02, math.radians(0.25)]) ** 2  # covariance of the odome
 
 
 def ring_drive(length):
-    """``length`` poses half a metre apart, counter-clockwise along the middle of the corridors from (3, 1)."""
+    """``length`` poses half a meter apart, counter-clockwise along the middle of the corridors from (3, 1)."""
     corners = np.array([[17.0, 1.0], [17.0, 11.0], [1.0, 11.0], [1.0, 1.0]])
     poses, here, corner = [], np.array([3.0, 1.0]), 0
     while len(poses) < length:
@@ -83,7 +83,7 @@ class Run:
                 self.covariances[h] = ad @ self.covariances[h] @ ad.T + STEP
         self.true_pose = true_pose
         scan = scan_in(self.walls, true_pose, stamp=sequence, noise=0.01, seed=sequence, **self.laser)
-        leaves = tuple(
+        hypotheses = tuple(
             HypothesisEstimate(
                 h,
                 self.replica.robot_areas[h],
@@ -96,7 +96,7 @@ class Run:
             )
             for h in sorted(self.poses)
         )
-        message = Keyframe(sequence, scan, 0.5 * sequence, leaves, mapping=mapping)
+        message = Keyframe(sequence, scan, 0.5 * sequence, hypotheses, mapping=mapping)
         assert self.tsbi.handle(message) == []
         self.replica.add_keyframe(message)
         return self._answer(sequence, self._events(sequence, cut, moved, merged))
@@ -114,18 +114,20 @@ class Run:
         self.notices += [notice.text for notice in notices]
         assert isinstance(answer, Hypotheses)
         assert answer.sequence == sequence
-        assert sum(leaf.probability for leaf in answer.hypotheses) + answer.unexamined == pytest.approx(1.0)
-        assert [leaf.id for leaf in answer.hypotheses] == sorted({leaf.id for leaf in answer.hypotheses})
+        assert sum(child.probability for child in answer.hypotheses) + answer.unexamined == pytest.approx(1.0)
+        assert [child.id for child in answer.hypotheses] == sorted({child.id for child in answer.hypotheses})
         self.replica.apply_hypotheses(answer)
         rebased = {
-            leaf.id: self.poses[leaf.parent]
-            if leaf.frame_change is None
-            else se2.compose(leaf.frame_change.mean, self.poses[leaf.parent])
-            for leaf in answer.hypotheses
+            child.id: self.poses[child.parent]
+            if child.frame_change is None
+            else se2.compose(child.frame_change.mean, self.poses[child.parent])
+            for child in answer.hypotheses
         }
         self.covariances = {
-            leaf.id: self.covariances[leaf.parent] if leaf.frame_change is None else len(leaf.moved_keyframes) * STEP
-            for leaf in answer.hypotheses
+            child.id: self.covariances[child.parent]
+            if child.frame_change is None
+            else len(child.moved_keyframes) * STEP
+            for child in answer.hypotheses
         }
         self.poses = rebased
         self.answers.append(answer)

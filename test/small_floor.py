@@ -48,12 +48,12 @@ def seen_at(pose, rng, barred=None):
     return scan_at(surfaces, se2.compose(BUILDING, pose), 0.01, rng, 720)
 
 
-def charted(crossing_driven=True, again=()):
+def make_chart(crossing_driven=True, again=()):
     """The chart, the map that it is of, and what its areas show.
 
     :param again: places, m along the hallway, where the robot looks once more afterwards, and where it is barred then.
     """
-    hybrid_map, scans = mapped(crossing_driven)
+    hybrid_map, scans = make_map(crossing_driven)
     rng = np.random.default_rng(2)
     for x, barred in again:
         keyframe, area, pose = len(scans), int(x > 8.0), np.array([x, 0.1, 0.0])
@@ -63,7 +63,7 @@ def charted(crossing_driven=True, again=()):
     return build_chart(hybrid_map, views, CONFIGURATION.features), hybrid_map, views
 
 
-def mapped(crossing_driven=True):
+def make_map(crossing_driven=True):
     """The map and its scans."""
     hybrid_map, scans, rng = HybridMap(), {}, np.random.default_rng(1)
     for k, pose in enumerate(keyframes(crossing_driven)):

@@ -38,8 +38,8 @@ def estimate(hypothesis, area, pose, stored=True):
     return HypothesisEstimate(hypothesis, area, exact(pose), stored, 0.0, 0.0, Clutter(), 12.0)
 
 
-def keyframe(k, world_pose, *leaves):
-    return Keyframe(k, worlds.scan_at(WORLD, world_pose), 0.5 * k, leaves)
+def keyframe(k, world_pose, *children):
+    return Keyframe(k, worlds.scan_at(WORLD, world_pose), 0.5 * k, children)
 
 
 def stay(k, *hypotheses, area=0):
@@ -59,7 +59,7 @@ def drive_until_cut(process, poses=THERE, origin=None):
     pytest.fail("no cut on the whole way")
 
 
-def into(area, event, k, hypothesis=0, parent=0, probability=1.0, new_T_old=None):
+def area_change(area, event, k, hypothesis=0, parent=0, probability=1.0, new_T_old=None):
     """TSBI's answer that the keyframes of a cut belong to ``area``."""
     new_T_old = np.zeros(3) if new_T_old is None else new_T_old
     poses = {i: se2.compose(new_T_old, se2.between(THERE[0], THERE[i])) for i in event.keyframes}
@@ -128,17 +128,17 @@ def test_every_keyframe_is_answered_once_and_nothing_else_is():
 def test_the_keyframes_that_left_begin_the_new_area():
     process = aam()
     event, k = drive_until_cut(process)
-    process.handle(Hypotheses(k, (into(1, event, k),)))
+    process.handle(Hypotheses(k, (area_change(1, event, k),)))
     (answer,) = process.handle(keyframe(k + 1, THERE[k + 1], estimate(0, 1, se2.between(THERE[0], THERE[k + 1]))))
     assert answer.events == ()
 
 
 @pytest.fixture
-def measured(monkeypatch):
+def pair_counts(monkeypatch):
     """The numbers of scan pairs that were compared, call by call."""
     counts = []
 
-    def counted(original):
+    def count_calls(original):
         def counting(one, pose, others, other_poses, radius):
             counts.append(len(others))
             return original(one, pose, others, other_poses, radius)
@@ -146,32 +146,32 @@ def measured(monkeypatch):
         return counting
 
     for name in ("overlaps", "sensed_overlaps"):
-        monkeypatch.setattr(aam_module, name, counted(getattr(aam_module, name)))
+        monkeypatch.setattr(aam_module, name, count_calls(getattr(aam_module, name)))
     return counts
 
 
-def test_a_new_keyframe_is_compared_with_each_of_its_area_once(measured):
+def test_a_new_keyframe_is_compared_with_each_of_its_area_once(pair_counts):
     process = aam(ncut_threshold=0.0)
     for k, pose in enumerate(THERE[:12]):
-        measured.clear()
+        pair_counts.clear()
         process.handle(keyframe(k, pose, estimate(0, 0, pose)))
         # Once with all for the graph and once with the eight nearest for the question whether the robot moved.
-        assert sum(measured) == k + min(k, 8)
+        assert sum(pair_counts) == k + min(k, 8)
         process.handle(stay(k, 0))
 
 
-def test_nothing_is_measured_again_when_hypotheses_branch_into_a_new_area(measured):
+def test_nothing_is_measured_again_when_hypotheses_branch_into_a_new_area(pair_counts):
     process = aam()
     event, k = drive_until_cut(process)
-    measured.clear()
-    process.handle(Hypotheses(k, (into(1, event, k, 1, 0, 0.6), into(2, event, k, 2, 0, 0.4))))
-    assert sum(measured) == 0
+    pair_counts.clear()
+    process.handle(Hypotheses(k, (area_change(1, event, k, 1, 0, 0.6), area_change(2, event, k, 2, 0, 0.4))))
+    assert sum(pair_counts) == 0
 
 
 def answered_in_first_room(process):
     """Rooms 0 and 1 known, the robot in room 1; returns the next keyframe's number."""
     event, k = drive_until_cut(process)
-    process.handle(Hypotheses(k, (into(1, event, k),)))
+    process.handle(Hypotheses(k, (area_change(1, event, k),)))
     process.handle(ClosureDecision(k, 0))
     for later in range(k + 1, len(THERE)):
         area_pose = se2.between(THERE[0], THERE[later])
@@ -184,8 +184,8 @@ def drive_back(process):
     """Drive back into the first room over known ground until something happens; (keyframe, world pose, event)."""
     back = worlds.drive((7.5, 2.0), (7.5, 3.0), (5.0, 3.0), (1.0, 2.0))
     for k, pose in enumerate(back, start=answered_in_first_room(process)):
-        leaf = estimate(0, 1, se2.between(THERE[0], pose), stored=False)
-        (answer,) = process.handle(keyframe(k, pose, leaf))
+        child = estimate(0, 1, se2.between(THERE[0], pose), stored=False)
+        (answer,) = process.handle(keyframe(k, pose, child))
         if answer.events:
             return k, pose, answer.events[0]
         process.handle(stay(k, 0, area=1))
@@ -200,11 +200,11 @@ def test_a_robot_that_returns_over_an_arc_has_moved_into_the_known_area():
 
 
 def moves_about(process, poses):
-    """The areas that the robot is said to move into while it goes to and fro on known ground, at first in area 1."""
+    """The areas that the robot moves into while it goes to and fro on known ground, at first in area 1."""
     area, moves = 1, []
     for k, pose in enumerate(poses, start=answered_in_first_room(process)):
-        leaf = estimate(0, area, se2.between(THERE[0], pose), stored=False)
-        (answer,) = process.handle(keyframe(k, pose, leaf))
+        child = estimate(0, area, se2.between(THERE[0], pose), stored=False)
+        (answer,) = process.handle(keyframe(k, pose, child))
         moves += [event.area for event in answer.events]
         area = moves[-1] if moves else 1
         process.handle(stay(k, 0, area=area))
@@ -227,7 +227,7 @@ def test_the_robots_own_keyframes_stay_where_they_are_and_become_known_ground():
     process = aam(confirmations=1, min_cluster=3)
     k, _, event = drive_back(process)
     process.handle(stay(k, 0, area=event.area))
-    # In room 0 again: its keyframes are known ground and cannot leave it, however few of them are asked for.
+    # In room 0 again: its keyframes are known ground and cannot leave it, however few of them are requested.
     for step, pose in enumerate(worlds.drive((4.0, 4.0), (4.0, 2.0)), start=k + 1):
         (answer,) = process.handle(keyframe(step, pose, estimate(0, 0, se2.between(THERE[0], pose))))
         cut = [event for event in answer.events if event.kind == "cut"]
@@ -235,17 +235,17 @@ def test_the_robots_own_keyframes_stay_where_they_are_and_become_known_ground():
         process.handle(stay(step, 0, area=0))
 
 
-def test_a_closure_puts_the_keyframes_beside_the_known_ones_and_compares_only_across(measured):
+def test_a_closure_puts_the_keyframes_beside_the_known_ones_and_compares_only_across(pair_counts):
     process = aam()
     event, k = drive_until_cut(process)
     # Played: the second room is taken for a known area, which here is area 0 itself under another name.
-    process.handle(Hypotheses(k, (into(7, event, k, 1, 0, 0.5), into(8, event, k, 2, 0, 0.5))))
-    measured.clear()
+    process.handle(Hypotheses(k, (area_change(7, event, k, 1, 0, 0.5), area_change(8, event, k, 2, 0, 0.5))))
+    pair_counts.clear()
     back = {i: se2.between(THERE[0], THERE[i]) for i in event.keyframes}
     relabelled = tuple(MovedKeyframe(i, 7, 0, pose) for i, pose in back.items())
     process.handle(Hypotheses(k + 1, (Hypothesis(1, 1, 1.0, 0, exact(np.zeros(3)), relabelled),)))
     known = k + 1 - len(event.keyframes)
-    assert sum(measured) == known * len(event.keyframes)
+    assert sum(pair_counts) == known * len(event.keyframes)
 
 
 def test_a_hypothesis_that_does_not_store_the_keyframe_is_not_cut():
@@ -257,10 +257,10 @@ def test_a_hypothesis_that_does_not_store_the_keyframe_is_not_cut():
         process.handle(stay(k, 0))
 
 
-def test_hypotheses_are_judged_each_by_its_own_map():
+def test_hypotheses_are_scored_each_by_its_own_map():
     process = aam()
     event, k = drive_until_cut(process)
-    process.handle(Hypotheses(k, (into(1, event, k, 1, 0, 0.6), Hypothesis(2, 0, 0.4, 0))))
+    process.handle(Hypotheses(k, (area_change(1, event, k, 1, 0, 0.6), Hypothesis(2, 0, 0.4, 0))))
     pose = se2.between(THERE[0], THERE[k + 1])
     (answer,) = process.handle(keyframe(k + 1, THERE[k + 1], estimate(1, 1, pose), estimate(2, 0, pose)))
     assert [(event.hypothesis, event.kind) for event in answer.events] == [(2, "cut")]
@@ -269,14 +269,14 @@ def test_hypotheses_are_judged_each_by_its_own_map():
 def test_acceptance_drops_the_other_hypotheses():
     process = aam()
     event, k = drive_until_cut(process)
-    process.handle(Hypotheses(k, (into(1, event, k, 1, 0, 0.9), Hypothesis(2, 0, 0.1, 0))))
+    process.handle(Hypotheses(k, (area_change(1, event, k, 1, 0, 0.9), Hypothesis(2, 0, 0.1, 0))))
     process.handle(ClosureDecision(k, 1))
     pose = se2.between(THERE[0], THERE[k + 1])
     (answer,) = process.handle(keyframe(k + 1, THERE[k + 1], estimate(1, 1, pose), estimate(2, 0, pose)))
     assert answer.events == ()
 
 
-def closed(process, around, error=(0.0, 0.0, 0.0)):
+def close_loop(process, around, error=(0.0, 0.0, 0.0)):
     """Rooms 0 and 1 known; area 2, begun at the first of the poses ``around``, is joined to area 0 by a closure.
 
     Returns the answer to the next keyframe, and that keyframe's number.
@@ -307,7 +307,7 @@ AGAIN = worlds.drive((2.0, 2.0), (4.5, 2.0), (4.5, 4.0))
 
 def test_a_room_that_was_taken_for_a_new_one_is_the_same_area_when_the_loop_is_closed():
     process = aam()
-    answer, k = closed(process, AGAIN)
+    answer, k = close_loop(process, AGAIN)
     (event,) = answer.events
     assert (event.hypothesis, event.kind, event.area, event.into) == (0, "merged", 2, 0)
     assert 0.8 < event.score <= 2.0
@@ -330,13 +330,13 @@ def test_a_room_that_was_taken_for_a_new_one_is_the_same_area_when_the_loop_is_c
 def test_another_room_stays_an_area_of_its_own_when_the_loop_is_closed():
     """Through the door much of the first room is seen, but an area of both would be cut again."""
     beyond = worlds.drive((10.0, 2.0), (8.0, 4.5), (10.0, 5.0))
-    answer, _ = closed(aam(), beyond)
+    answer, _ = close_loop(aam(), beyond)
     assert [event.kind for event in answer.events if event.kind == "merged"] == []
 
 
 def test_the_question_comes_again_when_the_robot_leaves_one_of_the_two_and_waits_for_one_hypothesis():
     process = aam()
-    _, k = closed(process, AGAIN)
+    _, k = close_loop(process, AGAIN)
     in_two, in_zero = se2.between(AGAIN[0], AGAIN[-1]), se2.between(THERE[0], AGAIN[-1])
     # TSBI finds that they contradict each other.
     process.handle(stay(k, 0, area=2))
@@ -350,15 +350,15 @@ def test_the_question_comes_again_when_the_robot_leaves_one_of_the_two_and_waits
     assert (event.kind, event.area, event.into) == ("merged", 2, 0)
 
 
-def test_two_areas_are_measured_again_only_where_the_arc_between_them_moved(measured):
+def test_two_areas_are_measured_again_only_where_the_arc_between_them_moved(pair_counts):
     process = aam()
-    answer, k = closed(process, AGAIN)
+    answer, k = close_loop(process, AGAIN)
     pose, before = se2.between(AGAIN[0], AGAIN[-1]), answer.events[0].score
     for later, error in enumerate((0.0, 0.001, 0.1), start=k):
         two_T_zero = se2.compose(se2.between(AGAIN[0], THERE[0]), (error, 0.0, 0.0))
         process.handle(stay(later, 0, area=2))
         process.handle(ClosureDecision(later, 0, (Arc(2, 0, exact(two_T_zero), closure=True),)))
-        measured.clear()
+        pair_counts.clear()
         (answer,) = process.handle(keyframe(later + 1, AGAIN[-1], estimate(0, 2, pose, stored=False)))
         moved = error == 0.1
-        assert (answer.events[0].score != before) == bool(measured) == moved
+        assert (answer.events[0].score != before) == bool(pair_counts) == moved

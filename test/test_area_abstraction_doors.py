@@ -13,13 +13,13 @@ from hmt_slam_ros.landmarks.landmarks import CONCAVE_CORNER, OPENING, ScanLandma
 from hmt_slam_ros.landmarks.opening_detection import LandmarkOpenings
 
 FEATURES = FeatureParameters()
-# Beams that tell nothing: so no landmark is missed.
+# Uninformative beams, so that no landmark is missed.
 BLIND = Rays(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, np.bool_))
 DOOR, OTHER = (3.2, 0.0, 0.0), (6.2, 0.0, 0.0)
 
 
-def shown(pose, openings, confidence=0.9, kind=OPENING):
-    """What a keyframe shows of openings, as landmarks with beams that tell nothing else."""
+def landmark_openings(pose, openings, confidence=0.9, kind=OPENING):
+    """What a keyframe shows of openings, as landmarks with uninformative beams otherwise."""
     poses = np.array([se2.between(pose, np.array(one)) for one in openings]).reshape(-1, 3)
     count = len(poses)
     covariances = np.tile(np.diag([0.02, 0.02, 0.01]) ** 2, (count, 1, 1))
@@ -33,7 +33,7 @@ def go(way, xs, openings, first=0, y=0.0, **how):
     for event, x in enumerate(xs, start=first):
         pose = np.array([x, y, 0.0])
         near = [one for one in openings if 0.0 < (one[0] - x) * np.cos(one[2]) < 2.0]
-        way = way.update(event, PoseGaussian(pose, np.eye(3) * 1e-4), shown(pose, near, **how))
+        way = way.update(event, PoseGaussian(pose, np.eye(3) * 1e-4), landmark_openings(pose, near, **how))
     return way
 
 
@@ -84,7 +84,7 @@ def test_in_another_frame_all_is_where_it_was():
     way = go(DoorTracker(), 0.5 * np.arange(6), [DOOR]).transform(frame)
     for event, x in ((6, 3.0), (7, 3.5)):
         pose = se2.compose(frame, np.array([x, 0.0, 0.0]))
-        way = way.update(event, PoseGaussian(pose, np.eye(3) * 1e-4), shown(pose, []))
+        way = way.update(event, PoseGaussian(pose, np.eye(3) * 1e-4), landmark_openings(pose, []))
     (passage,) = way.crossings
     np.testing.assert_allclose(passage.pose, se2.compose(frame, np.array(DOOR)), atol=1e-6)
 

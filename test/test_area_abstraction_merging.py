@@ -20,7 +20,7 @@ def drive():
 
 
 @pytest.fixture(scope="module")
-def merged(drive):
+def merged_areas(drive):
     """{keyframe event: the robot's area before and after it} of those at which an area became part of another."""
     recording, _ = drive
     rows = {row.keyframe: row for row in recording.probabilities}
@@ -29,8 +29,8 @@ def merged(drive):
     return {k: (rows[k - 1].area, rows[k].area) for k in fewer}
 
 
-def test_the_robots_own_area_may_be_the_one_that_is_no_more(drive, merged):
-    left = [before for before, after in merged.values() if before != after]
+def test_the_robots_own_area_may_be_the_one_that_is_no_more(drive, merged_areas):
+    left = [before for before, after in merged_areas.values() if before != after]
     assert left != []
     areas = drive[0].hybrid_map.area_ids()
     assert not set(left) & set(areas)
@@ -55,10 +55,10 @@ def test_every_process_has_the_same_map_from_messages_alone(drive):
             np.testing.assert_array_equal(arc.pose.covariance, other.pose.covariance)
 
 
-def test_the_published_pose_does_not_jump_when_areas_become_one(drive, merged):
+def test_the_published_pose_does_not_jump_when_areas_become_one(drive, merged_areas):
     recording, _ = drive
     stamps = {row.keyframe: row.stamp for row in recording.probabilities}
-    for k in merged:
+    for k in merged_areas:
         row = int(np.searchsorted(recording.stamps, stamps[k]))
         step = se2.between(*recording.online_trajectory[row : row + 2])
         driven = se2.between(*recording.odometry[row : row + 2])
@@ -77,9 +77,9 @@ class Until:
         return (record for record in open_log(LOG).records() if record.measurement.stamp <= self.stamp)
 
 
-def test_a_log_may_end_when_the_robots_area_becomes_part_of_another(drive, merged):
+def test_a_log_may_end_when_the_robots_area_becomes_part_of_another(drive, merged_areas):
     stamps = {row.keyframe: row.stamp for row in drive[0].probabilities}
-    k, after = next((k, after) for k, (before, after) in merged.items() if before != after)
+    k, after = next((k, after) for k, (before, after) in merged_areas.items() if before != after)
     recording, _ = run(Until(stamps[k]), Configuration())
     assert recording.probabilities[-1].keyframe == k
     assert recording.last_estimate.area == recording.replica.robot_areas[recording.replica.best_hypothesis] == after

@@ -1,4 +1,4 @@
-"""Normalised cut on graphs whose best bipartition is known, and against all bipartitions of small random graphs."""
+"""Normalized cut on graphs whose best bipartition is known, and against all bipartitions of small random graphs."""
 
 import itertools
 
@@ -59,7 +59,7 @@ def test_equal_parts_joined_as_strongly_as_within_have_the_value_of_shi_and_mali
     assert ncut(similarity, np.array([False, False, True, True])) == pytest.approx(2.0 / 3.0)
 
 
-def test_two_cliques_with_weak_ties_are_told_apart():
+def test_two_cliques_with_weak_ties_are_separated():
     cut = normalized_cut(blocks(6, 9, between=0.01))
     np.testing.assert_array_equal(cut.side, np.arange(15) >= 6)
     assert cut.value == pytest.approx(54 * 0.01 / (30 + 0.54) + 54 * 0.01 / (72 + 0.54))
@@ -91,7 +91,7 @@ def test_small_random_graphs_are_cut_as_well_as_by_trying_everything(min_size):
     assert np.max(excess) < 0.1
 
 
-def test_parts_are_at_least_as_large_as_asked_for():
+def test_parts_are_at_least_as_large_as_requested():
     similarity = blocks(2, 10, between=0.001)
     assert normalized_cut(similarity).side.sum() == 10
     larger = normalized_cut(similarity, min_size=4)
@@ -120,7 +120,7 @@ def test_contracting_nodes_keeps_the_value_of_a_cut_that_does_not_split_them():
     )
 
 
-def test_separate_components_are_told_apart_at_no_cost():
+def test_separate_components_are_separated_at_no_cost():
     cut = normalized_cut(blocks(4, 6, 5), min_size=3)
     assert cut.value == 0.0
     assert {tuple(cut.side[:4]), tuple(cut.side[4:10]), tuple(cut.side[10:])} <= {

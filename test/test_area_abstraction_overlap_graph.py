@@ -17,7 +17,7 @@ def rooms(*sizes, between=0.02):
 
 
 class Meter:
-    """Measures |i - j| / 100 and remembers what it was asked."""
+    """Measures |i - j| / 100 and remembers its calls."""
 
     def __init__(self):
         self.asked = []

@@ -21,10 +21,10 @@ DOOR = 6.0
 
 
 def by_policy(policy, **changes):
-    return area_abstraction(configured(policy, **changes))
+    return area_abstraction(configure(policy, **changes))
 
 
-def configured(policy, **changes):
+def configure(policy, **changes):
     own = {"area_policy": policy, "ncut_threshold": 0.0, "min_cluster": 3, "confirmations": 2} | changes
     return with_changes(Configuration(), OPTIONS | {f"aam.{name}": value for name, value in own.items()})
 
@@ -32,8 +32,8 @@ def configured(policy, **changes):
 def looking_ahead(process, poses=THROUGH, first=0):
     """The event of the first cut, where the laser sees half a circle; and its keyframe."""
     for k, pose in enumerate(poses[first:], start=first):
-        leaf = estimate(0, 0, se2.between(poses[0], pose))
-        (answer,) = process.handle(Keyframe(k, worlds.scan_in(WORLD, pose, beams=361), 0.5 * k, (leaf,)))
+        hypothesis = estimate(0, 0, se2.between(poses[0], pose))
+        (answer,) = process.handle(Keyframe(k, worlds.scan_in(WORLD, pose, beams=361), 0.5 * k, (hypothesis,)))
         if answer.events:
             return answer.events[0], k
         process.handle(stay(k, 0))
@@ -62,7 +62,7 @@ def test_what_openings_were_seen_and_passed_is_part_of_the_state(stop, tmp_path)
     writer.write("aam", process.state)
     writer.finish("state", 1)
     state = FolderReader(tmp_path, "state", 1).read("aam", AamState)
-    again = area_abstraction(configured("both", **options), state)
+    again = area_abstraction(configure("both", **options), state)
     found, at = looking_ahead(again, THROUGH, stop)
     assert (found.keyframes, found.score, at) == (event.keyframes, event.score, k)
 
@@ -70,13 +70,13 @@ def test_what_openings_were_seen_and_passed_is_part_of_the_state(stop, tmp_path)
 def test_a_state_of_another_policy_goes_on_by_the_own_one():
     process = by_policy("ncut")
     assert looking_ahead(process, THROUGH[:8]) is None
-    event, _ = looking_ahead(area_abstraction(configured("both", ncut_threshold=0.5), process.state), THROUGH, 8)
+    event, _ = looking_ahead(area_abstraction(configure("both", ncut_threshold=0.5), process.state), THROUGH, 8)
     assert event.keyframes[0] == 10
 
 
 @pytest.mark.parametrize(("policy", "merged"), [("ncut", True), ("both", False)])
 def test_areas_with_an_opening_between_them_are_not_one(policy, merged):
-    """Played: a closure joins the two rooms, and by a radius of overlap of metres nothing separates them."""
+    """Played: a closure joins the two rooms, and by a radius of overlap of meters nothing separates them."""
     process = by_policy("both", ncut_threshold=0.5, portal_factor=0.01)
     event, k = drive_until_cut(process, THROUGH)
     poses = {i: se2.between(THROUGH[0], THROUGH[i]) for i in event.keyframes}
@@ -85,12 +85,12 @@ def test_areas_with_an_opening_between_them_are_not_one(policy, merged):
     process.handle(Hypotheses(k, (Hypothesis(0, 0, 1.0, 1, exact(np.zeros(3)), begun, (arc,)),)))
     process.handle(ClosureDecision(k, 0, (arc,)))
     changed = {"ncut_threshold": 0.3, "overlap_radius": 2.0, "min_cluster": 5, "portal_factor": 0.01}
-    process = area_abstraction(configured(policy, **changed), process.state)
-    leaf = estimate(0, 1, poses[k], stored=False)
-    (answer,) = process.handle(keyframe(k + 1, THROUGH[k], leaf))
+    process = area_abstraction(configure(policy, **changed), process.state)
+    hypothesis = estimate(0, 1, poses[k], stored=False)
+    (answer,) = process.handle(keyframe(k + 1, THROUGH[k], hypothesis))
     assert [event.kind for event in answer.events] == ["merged"] * merged
 
 
 def test_a_partition_by_doors_without_landmarks_is_refused():
     with pytest.raises(HmtSlamError, match="area_policy = both needs landmarks"):
-        Aam(configured("both"))
+        Aam(configure("both"))

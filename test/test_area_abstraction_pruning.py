@@ -45,13 +45,13 @@ class Rounds:
             if isinstance(record.measurement, Scan) and self.run.scans_read * LAPS >= self.log.scan_count * (
                 len(self.keyframes) + 1
             ):
-                self.keyframes.append(len(self.placed))
+                self.keyframes.append(len(self.area_of_keyframe))
         self.result = self.run.finish()
         self.log_state = self.result.log_progress
         self.recording = self.run.recorder.finish(self.log_state.stamps)
 
     @property
-    def placed(self):
+    def area_of_keyframe(self):
         """{keyframe: its area} of the map, of which there is one."""
         replica = self.run.state.processes["slam"].replica
         return {k for area in replica.common.area_keyframes().values() for k in area} | {
@@ -81,7 +81,7 @@ def test_what_is_forgotten_was_stored_before_and_is_gone_in_every_process(rounds
     ):
         assert not gone & replica.scans.keys()
         assert replica.scans.keys() == state.processes["slam"].replica.scans.keys()
-    assert not gone & rounds.placed
+    assert not gone & rounds.area_of_keyframe
     for live in state.processes["slam"].live_hypotheses.values():
         assert not gone & {
             *live.particle_filter.keyframes,
@@ -94,7 +94,7 @@ def test_what_is_forgotten_was_stored_before_and_is_gone_in_every_process(rounds
 
 def test_every_scan_keeps_its_pose_relative_to_a_keyframe_that_is_there(rounds):
     scans = rounds.recording.relative_trajectory
-    assert set(scans.keyframes.tolist()) <= rounds.placed
+    assert set(scans.keyframes.tolist()) <= rounds.area_of_keyframe
     known = scans.keyframes >= 0
     assert known.all()
     assert np.hypot(*scans.poses[:, :2].T).max() < 3.0
@@ -105,7 +105,7 @@ def test_every_scan_keeps_its_pose_relative_to_a_keyframe_that_is_there(rounds):
     assert away.max() < 0.3
 
 
-def test_a_record_instead_of_messages_tells_the_same(rounds):
+def test_a_record_gives_the_same_as_messages(rounds):
     assert rounds.kept < 100 < len(rounds.run.recorder.keyframes)
     folded = rounds.folding.finish(rounds.log_state.stamps)
     for name in ("trajectory", "online_trajectory", "odometry"):

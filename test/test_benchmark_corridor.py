@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmark.corridor import Drive, drive, errors_of, report
+from benchmark.corridor import CorridorDrive, drive, errors_of, report
 
 
 @pytest.fixture(scope="module")
@@ -15,16 +15,16 @@ def test_the_covariance_along_a_bare_corridor_covers_the_truth(drives):
     for stride, low, high, covered in ((1, 0.7, 1.3, 0.9), (20, 0.5, 1.7, 0.85)):
         found = errors_of(drives, stride)
         assert low < found.nees[0] < high
-        assert found.covered[0] >= covered
+        assert found.coverage[0] >= covered
         # Across, what is no drift is within the floor that arcs have.
         assert found.nees[1] < 1.0
-        assert found.covered[1] >= 0.95
+        assert found.coverage[1] >= 0.95
 
 
 def test_a_bare_corridor_neither_shrinks_nor_grows(drives):
     for stride in (1, 20):
-        shrink, deviation = errors_of(drives, stride).shrink
-        assert abs(shrink) < 2.5 * deviation
+        shortening, deviation = errors_of(drives, stride).shortening
+        assert abs(shortening) < 2.5 * deviation
         assert deviation < 0.003
 
 
@@ -36,7 +36,7 @@ def test_along_a_bare_corridor_the_robot_is_as_uncertain_as_its_odometry_and_acr
     assert across < 0.3 * along
 
 
-def made_up(share, seed):
+def make_drive(share, seed):
     """A straight drive whose estimate is too short by a share and as far off as is stated."""
     random = np.random.default_rng(seed)
     slips = 0.1 * random.standard_normal((40, 2))
@@ -46,22 +46,22 @@ def made_up(share, seed):
         for moves in (moved, moved * (1.0 - share) + slips)
     )
     covariances = np.tile(np.diag([0.01, 0.01, 1e-12]), (41, 1, 1))
-    return Drive(truths, poses, covariances, np.concatenate(([0.0], np.cumsum(slips[:, 0]))))
+    return CorridorDrive(truths, poses, covariances, np.concatenate(([0.0], np.cumsum(slips[:, 0]))))
 
 
 @pytest.mark.parametrize("stride", [1, 4])
 def test_figures_of_a_drive_that_is_as_stated(stride):
-    found = errors_of([made_up(0.0, seed) for seed in range(100)], stride)
+    found = errors_of([make_drive(0.0, seed) for seed in range(100)], stride)
     assert len(found.errors) == 100 * (40 // stride)
     np.testing.assert_allclose(found.variances, 0.01 * stride, rtol=1e-6)
     np.testing.assert_allclose(found.lengths, stride)
     np.testing.assert_allclose(found.nees, 1.0, atol=0.1)
-    np.testing.assert_allclose(found.covered, 0.95, atol=0.02)
-    assert found.shrink[0] == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(found.coverage, 0.95, atol=0.02)
+    assert found.shortening[0] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_figures_of_a_drive_that_shrinks():
-    found = errors_of([made_up(0.05, seed) for seed in range(4)], 4)
-    assert found.shrink[0] == pytest.approx(0.05)
+    found = errors_of([make_drive(0.05, seed) for seed in range(4)], 4)
+    assert found.shortening[0] == pytest.approx(0.05)
     assert found.nees[0] > 1.5 > found.nees[1]
-    assert "+5.00 ± 0.00" in report([made_up(0.05, seed) for seed in range(4)])
+    assert "+5.00 ± 0.00" in report([make_drive(0.05, seed) for seed in range(4)])

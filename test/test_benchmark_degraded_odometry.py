@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from benchmark.degraded_odometry import KINDS, degraded
+from benchmark.degraded_odometry import KINDS, degrade_log
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.sensors import Odometry, Scan
@@ -34,9 +34,9 @@ class ListedLog:
             yield LogRecord(stamp, Scan(stamp, np.ones(3, dtype=np.float32), 0.0, 0.1, 0.0, 10.0))
 
 
-def straight(metres, readings):
+def straight(distance, readings):
     poses = np.zeros((readings + 1, 3))
-    poses[:, 0] = np.linspace(0.0, metres, readings + 1)
+    poses[:, 0] = np.linspace(0.0, distance, readings + 1)
     return ListedLog(poses)
 
 
@@ -59,36 +59,39 @@ def increments(log):
 @pytest.mark.parametrize("kind", KINDS)
 def test_scans_and_stamps_stay_and_one_seed_gives_one_log(kind):
     log = turning(20)
-    worse, again, other = degraded(log, kind, 3), degraded(log, kind, 3), degraded(log, kind, 4)
+    worse, again, other = degrade_log(log, kind, 3), degrade_log(log, kind, 3), degrade_log(log, kind, 4)
     assert (worse.scan_count, worse.duration) == (log.scan_count, log.duration)
     scans = [record.measurement.stamp for record in worse.records() if isinstance(record.measurement, Scan)]
     assert scans == [record.measurement.stamp for record in log.records() if isinstance(record.measurement, Scan)]
     stamps = [reading.stamp for reading in readings(worse)]
     assert set(stamps) <= {reading.stamp for reading in readings(log)}
     assert stamps == [reading.stamp for reading in readings(again)]
-    for one, two in zip(readings(worse), readings(again), strict=True):
-        np.testing.assert_array_equal(one.pose, two.pose)
+    for reading, other_reading in zip(readings(worse), readings(again), strict=True):
+        np.testing.assert_array_equal(reading.pose, other_reading.pose)
     if kind not in {"none", "missing"}:
-        assert any((one.pose != two.pose).any() for one, two in zip(readings(worse), readings(other), strict=True))
+        assert any(
+            (reading.pose != other_reading.pose).any()
+            for reading, other_reading in zip(readings(worse), readings(other), strict=True)
+        )
 
 
 @pytest.mark.parametrize(("kind", "factor"), [("noise-2x", np.sqrt(3.0)), ("noise-4x", np.sqrt(15.0))])
-@pytest.mark.parametrize("per_metre", [4, 40])
-def test_the_noise_over_a_metre_is_the_models_whatever_the_rate_of_the_readings(kind, factor, per_metre):
-    metres = 2000
-    errors = increments(degraded(straight(metres, metres * per_metre), kind, 0)) - [1.0 / per_metre, 0.0, 0.0]
-    # The lateral errors of the readings within one metre are of the frame of each, not turned by those before.
-    deviations = errors.reshape(metres, per_metre, 3).sum(axis=1).std(axis=0)
+@pytest.mark.parametrize("per_meter", [4, 40])
+def test_the_noise_over_a_meter_is_the_models_whatever_the_rate_of_the_readings(kind, factor, per_meter):
+    distance = 2000
+    errors = increments(degrade_log(straight(distance, distance * per_meter), kind, 0)) - [1.0 / per_meter, 0.0, 0.0]
+    # The lateral errors of the readings within one meter are of the frame of each, not turned by those before.
+    deviations = errors.reshape(distance, per_meter, 3).sum(axis=1).std(axis=0)
     np.testing.assert_allclose(deviations, factor * np.array([0.1, 0.1, np.radians(2.0)]), rtol=0.05)
 
 
 def test_a_robot_that_stands_gets_no_noise():
-    np.testing.assert_array_equal(increments(degraded(straight(0.0, 50), "noise-4x", 0)), 0.0)
+    np.testing.assert_array_equal(increments(degrade_log(straight(0.0, 50), "noise-4x", 0)), 0.0)
 
 
 def test_one_turn_in_five_slips_by_twenty_degrees_either_way_within_a_second():
     log = turning(400)
-    errors = np.degrees(se2.wrap(increments(degraded(log, "slip", 0))[:, 2] - increments(log)[:, 2]))
+    errors = np.degrees(se2.wrap(increments(degrade_log(log, "slip", 0))[:, 2] - increments(log)[:, 2]))
     turns = errors.reshape(400, 50)
     slips = turns.sum(axis=1)
     slipped = np.abs(slips) > 1e-6
@@ -101,10 +104,10 @@ def test_one_turn_in_five_slips_by_twenty_degrees_either_way_within_a_second():
 
 def test_readings_miss_at_random_or_all_of_them():
     log = straight(100.0, 4000)
-    assert len(readings(degraded(log, "missing", 0))) == pytest.approx(0.95 * 4001, abs=50)
-    assert readings(degraded(log, "none", 0)) == []
+    assert len(readings(degrade_log(log, "missing", 0))) == pytest.approx(0.95 * 4001, abs=50)
+    assert readings(degrade_log(log, "none", 0)) == []
 
 
 def test_another_kind_is_refused():
     with pytest.raises(ValueError, match="'noise-3x' is no kind"):
-        degraded(straight(1.0, 2), "noise-3x", 0)
+        degrade_log(straight(1.0, 2), "noise-3x", 0)

@@ -7,7 +7,7 @@ import pytest
 from benchmark.identity import EXPECTED, RUNS, differences, digests_of, read_expected, write_expected
 from hmt_slam_ros.errors import HmtSlamError
 
-DIGESTS = {"office": {"trajectory": "a1", "map": "b2"}, "gone on": {"trajectory": "c3"}}
+DIGESTS = {"office": {"trajectory": "a1", "map": "b2"}, "continued": {"trajectory": "c3"}}
 
 FILES = {
     "trajectory.tum": "1.0 0.5 0.25 0 0 0 0 1\n",
@@ -31,12 +31,12 @@ def test_what_is_recorded_is_read(tmp_path):
 
 
 def test_digests_that_differ_are_counted_and_fail():
-    other = {"office": {"trajectory": "a1", "map": "b3"}, "gone on": {"trajectory": "c3"}}
-    assert [(one.value, one.met) for one in differences(other, DIGESTS)] == [(1, False), (0, True)]
+    other = {"office": {"trajectory": "a1", "map": "b3"}, "continued": {"trajectory": "c3"}}
+    assert [(one.value, one.is_met) for one in differences(other, DIGESTS)] == [(1, False), (0, True)]
 
 
 def test_a_run_of_which_nothing_is_recorded_fails():
-    assert not differences({"new": {"map": "b2"}}, DIGESTS)[0].met
+    assert not differences({"new": {"map": "b2"}}, DIGESTS)[0].is_met
 
 
 @pytest.mark.parametrize(

@@ -5,17 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from benchmark.institute import (
-    Estimate,
-    Mission,
-    _mission_requirements,
-    _transitions,
-    open_doors,
-    recovery,
-    way_length,
-)
-from benchmark.institute_maps import InstituteMap, judged, scenario_of
-from benchmark.report import VALIDATION, marks
+from benchmark.institute import false_transitions, mission_requirements
+from benchmark.institute_drives import Estimate, Mission, open_doors, path_length, recovery
+from benchmark.institute_maps import InstituteMap, scenario_of, score_chart
+from benchmark.report import VALIDATION, document_marks
 from hmt_slam_ros.exploration.rooms import Destination
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -37,13 +30,13 @@ def mission(rights, confident=True):
 
 def test_what_is_required_of_missions():
     good, bad = mission([True] * 10), mission([True] * 8 + [False] * 2)
-    assert all(one.met for one in _mission_requirements([good]))
-    values = {one.name: one.value for one in _mission_requirements([good, bad])}
+    assert all(one.is_met for one in mission_requirements([good]))
+    values = {one.name: one.value for one in mission_requirements([good, bad])}
     assert values["missions that succeed"] == 0.5
     assert values["false estimates"] == values["confident false estimates"] == pytest.approx(0.1)
     assert values["false state transitions"] == pytest.approx(2 / 18)
-    assert _transitions([bad]) == [False] * 7 + [True] * 2
-    unsure = {one.name: one.value for one in _mission_requirements([mission([False] * 4, confident=False)])}
+    assert false_transitions([bad]) == [False] * 7 + [True] * 2
+    unsure = {one.name: one.value for one in mission_requirements([mission([False] * 4, confident=False)])}
     assert (unsure["confident false estimates"], unsure["unconfident estimates"]) == (0.0, 1.0)
 
 
@@ -53,20 +46,20 @@ def institute():
     states = scenario.building.states
     kinds = [CROSSING if crossing else DOOR for crossing in states.crossings]
     nodes = tuple(ChartNode(0, pose, kind, 1.0, ()) for pose, kind in zip(states.poses, kinds, strict=True))
-    ways = [Edge(k, d, k + 1, d, (5.0, 0.01), (0.0, 0.01), EMPTY) for k, d in enumerate((NORTH, NORTH, EAST))]
-    edges = tuple(edge for way in ways for edge in (way, way.reverse))
+    edges_one_way = [Edge(k, d, k + 1, d, (5.0, 0.01), (0.0, 0.01), EMPTY) for k, d in enumerate((NORTH, NORTH, EAST))]
+    edges = tuple(edge for edge in edges_one_way for edge in (edge, edge.reverse))
     return InstituteMap(scenario, None, {}, {}, Chart(nodes, (), edges), {0: np.zeros(3)})
 
 
 def test_missions_are_from_open_door_to_open_door():
-    charted = institute()
-    doors = [k for k, node in enumerate(charted.chart.nodes) if node.kind == DOOR]
-    places = {k: behind_door(k, charted.nodes[k]) for k in doors}
-    assert open_doors(charted, charted.scenario, places) == doors
+    chart_map = institute()
+    doors = [k for k, node in enumerate(chart_map.chart.nodes) if node.kind == DOOR]
+    places = {k: behind_door(k, chart_map.nodes[k]) for k in doors}
+    assert open_doors(chart_map, chart_map.scenario, places) == doors
     changed = scenario_of(0, visit=1, changed=0.5)
-    assert set(open_doors(charted, changed, places)) < set(doors)
-    opposite = {k: behind_door(k, charted.nodes[k] + (0.0, 0.0, np.pi)) for k in doors}
-    assert open_doors(charted, charted.scenario, opposite) == []
+    assert set(open_doors(chart_map, changed, places)) < set(doors)
+    opposite = {k: behind_door(k, chart_map.nodes[k] + (0.0, 0.0, np.pi)) for k in doors}
+    assert open_doors(chart_map, chart_map.scenario, opposite) == []
 
 
 def behind_door(node, pose):
@@ -77,10 +70,10 @@ def behind_door(node, pose):
 
 
 def test_the_shortest_way_between_two_nodes():
-    charted = institute()
-    assert way_length(charted, 0, 2) == pytest.approx(10.0)
-    assert way_length(charted, 3, 0) == pytest.approx(15.0)
-    assert float(se2.wrap(charted.nodes[0, 2] - charted.scenario.building.states.poses[0, 2])) == 0.0
+    chart_map = institute()
+    assert path_length(chart_map, 0, 2) == pytest.approx(10.0)
+    assert path_length(chart_map, 3, 0) == pytest.approx(15.0)
+    assert float(se2.wrap(chart_map.nodes[0, 2] - chart_map.scenario.building.states.poses[0, 2])) == 0.0
 
 
 def estimate(arrivals, right=True, confident=True):
@@ -109,9 +102,9 @@ def chart_of_states(changed=()):
 
 
 def test_a_chart_of_the_states_has_all_and_confuses_none():
-    found = judged(chart_of_states())
+    found = score_chart(chart_of_states())
     assert (found.states, found.detected, found.confused) == (13, 13, 0)
-    np.testing.assert_allclose(found.off, 0.1)
+    np.testing.assert_allclose(found.offsets, 0.1)
 
 
 @pytest.mark.parametrize(
@@ -123,11 +116,11 @@ def test_a_chart_of_the_states_has_all_and_confuses_none():
     ],
 )
 def test_what_is_missing_and_what_is_confused(change, detected, confused):
-    found = judged(chart_of_states({0: change}.items()))
+    found = score_chart(chart_of_states({0: change}.items()))
     assert (found.detected, found.confused) == (detected, confused)
-    assert math.isclose(max(found.off), 0.1)
+    assert math.isclose(max(found.offsets), 0.1)
 
 
 def test_the_document_has_a_place_for_it():
     text = VALIDATION.read_text()
-    assert all(text.count(mark) == 1 for mark in marks("institute"))
+    assert all(text.count(mark) == 1 for mark in document_marks("institute"))

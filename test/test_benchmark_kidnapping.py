@@ -1,21 +1,31 @@
-"""What is made of what a robot says that was carried while it drove."""
+"""Scores of kidnapped robots by their localization."""
 
 import math
 
 import pytest
 
-from benchmark.kidnapping import KINDS, SOON, Heard, drawn, judged, kidnapped, requirements
+from benchmark.kidnapping import (
+    KINDS,
+    SOON,
+    LocalizationReport,
+    draw_drive,
+    drive_kidnapped,
+    requirements,
+    summarize_drive,
+)
 from hmt_slam_ros.open_log import open_log
 
 LOST, RIGHT, WRONG = (False, False, False), (True, True, True), (True, True, False)
 
 
-def told(*said):
-    return judged([Heard(float(k), *one) for k, one in enumerate(said)], (0.02, 0.03), float(len(said)))
+def summarize(*states):
+    return summarize_drive(
+        [LocalizationReport(float(k), *one) for k, one in enumerate(states)], (0.02, 0.03), float(len(states))
+    )
 
 
 @pytest.mark.parametrize(
-    ("said", "noticed", "again", "confident", "wrong"),
+    ("states", "noticed", "again", "confident", "wrong"),
     [
         ((WRONG, WRONG, LOST, LOST, RIGHT, RIGHT), 2.0, 4.0, 0.0, False),
         ((WRONG, LOST, WRONG, WRONG, RIGHT), 1.0, 4.0, 2.0, False),
@@ -24,20 +34,23 @@ def told(*said):
     ],
     ids=["noticed and found", "found in a wrong place first", "never noticed", "lost again"],
 )
-def test_a_drive_is_judged_by_what_the_robot_says(said, noticed, again, confident, wrong):
-    found = told(*said)
+def test_a_drive_is_scored_by_the_localization_of_the_robot(states, noticed, again, confident, wrong):
+    found = summarize(*states)
     assert (found.noticed, found.again, found.confident, found.wrong) == (noticed, again, confident, wrong)
 
 
 def test_a_confident_wrong_answer_and_one_that_comes_late_are_faults():
-    met = [one.met for one in requirements("office, known", [told(LOST, RIGHT), told(LOST, WRONG, WRONG, RIGHT)])]
+    met = [
+        one.is_met
+        for one in requirements("office, known", [summarize(LOST, RIGHT), summarize(LOST, WRONG, WRONG, RIGHT)])
+    ]
     assert met == [True, False]
-    assert not requirements("office, known", [told(*[WRONG] * 7, LOST)])[0].met
+    assert not requirements("office, known", [summarize(*[WRONG] * 7, LOST)])[0].is_met
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_robot_is_carried_once_and_its_wheels_do_not_notice(kind):
-    log = open_log(drawn("ring", kind, 1))
+def test_the_robot_is_kidnapped_once_without_odometry(kind):
+    log = open_log(draw_drive("ring", kind, 1))
     drive = log.scenario.settings
     assert (drive.carried > 0.5) == (kind == "known")
     assert drive.to > drive.carried
@@ -55,8 +68,8 @@ def test_the_robot_is_carried_once_and_its_wheels_do_not_notice(kind):
     [("busy", "known", 1000), ("office", "unknown", 8)],
     ids=["among people", "where little but passed walls contradicts, keyframe by keyframe"],
 )
-def test_a_robot_notices_that_it_was_carried_and_finds_itself(world, kind, seed):
-    found = kidnapped(drawn(world, kind, seed))
+def test_a_kidnapping_is_detected_and_the_robot_relocalized(world, kind, seed):
+    found = drive_kidnapped(draw_drive(world, kind, seed))
     assert found.noticed <= SOON
     assert not found.wrong
     assert max(found.errors) < 0.1

@@ -1,9 +1,9 @@
-"""Laps over known ground: what is asked for, and that it is measured on a run."""
+"""Laps over known ground: the requirements, and a measurement of a run."""
 
 import pytest
 
-from benchmark.laps import Lap, Laps, driven, requirements
-from benchmark.report import VALIDATION, marks
+from benchmark.laps import Lap, Laps, drive_laps, requirements
+from benchmark.report import VALIDATION, document_marks
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.open_log import open_log
 
@@ -24,8 +24,8 @@ def laps(last, error=0.03, count=20):
         (Lap(10, 200, 200, 1_000_000, 250_000_000, 0, 1, 1.0), 0.04, "the error"),
     ],
 )
-def test_what_grows_is_told(last, error, unmet):
-    failed = [asked.name for asked in requirements("office", laps(last, error)) if not asked.met]
+def test_what_grows_is_reported(last, error, unmet):
+    failed = [requirement.name for requirement in requirements("office", laps(last, error)) if not requirement.is_met]
     assert failed == ([] if unmet is None else [f"office, lap 3 to 20: growth of {unmet}"])
 
 
@@ -34,7 +34,7 @@ def test_a_log_of_few_passes_is_compared_with_the_first():
 
 
 def test_the_laps_of_a_run_are_measured():
-    found = driven("sim:office,size=0.7,rate=1.5,laps=2", None, 2, Configuration())
+    found = drive_laps("sim:office,size=0.7,rate=1.5,laps=2", None, 2, Configuration())
     assert len(found.laps) == len(found.errors) == 2
     assert all(3 <= lap.areas <= 6 and 100 < lap.keyframes <= lap.scans + 5 for lap in found.laps)
     scans = open_log("sim:office,size=0.7,rate=1.5,laps=2").scan_count
@@ -45,4 +45,4 @@ def test_the_laps_of_a_run_are_measured():
 
 def test_the_document_has_a_place_for_the_tables():
     text = VALIDATION.read_text()
-    assert all(text.count(mark) == 1 for mark in marks("laps"))
+    assert all(text.count(mark) == 1 for mark in document_marks("laps"))

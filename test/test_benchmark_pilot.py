@@ -1,4 +1,4 @@
-"""The measurement of the pilot's errands through nodes."""
+"""The measurement of the pilot's tasks through nodes."""
 
 from pathlib import Path
 
@@ -7,48 +7,48 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from benchmark.pilot import Explored, Ran, _awakening, _row, _scored, requirements
-from benchmark.report import VALIDATION, marks
+from benchmark.pilot import _COLUMNS, ExploredBuilding, TaskRun, _draw_start, _score_task, requirements
+from benchmark.report import VALIDATION, document_marks
 from hmt_slam_ros.geometry import se2
 
 IN_MAP, IN_WORLD = np.array([1.0, 2.0, 0.3]), np.array([-4.0, 5.0, 1.0])
-BUILDING = Explored(0, Path(), {7: (IN_MAP, IN_WORLD)}, {"room 1": (7, np.array([3.0, 4.0]))})
+BUILDING = ExploredBuilding(0, Path(), {7: (IN_MAP, IN_WORLD)}, {"room 1": (7, np.array([3.0, 4.0]))})
 WORLD = "sim:institute,seed=0,people=0,laps=1"
 
 
-def ran(end, text="go room 1: the robot is there", told=(0.0, 0.0, 0.0), contacts=0):
-    """An errand that begins 10 m off, slam being told a pose that the robot is so far away from."""
+def run(end, text="go room 1: the robot is there", offset=(0.0, 0.0, 0.0), contacts=0):
+    """A task that begins 10 m off, with an initial pose that is wrong by an offset."""
     place = np.array([0.5, -0.5, 0.2])
-    start = se2.compose(IN_MAP, place), se2.compose(se2.compose(IN_WORLD, place), np.array(told))
-    return Ran(text, np.array([(3.0, 14.0), end]), 20.0, contacts, [start])
+    start = se2.compose(IN_MAP, place), se2.compose(se2.compose(IN_WORLD, place), np.array(offset))
+    return TaskRun(text, np.array([(3.0, 14.0), end]), 20.0, contacts, [start])
 
 
-def values(*errands):
-    scored = [_scored(BUILDING, one, "room 1") for one in errands]
-    return {one.name: (one.value, one.met) for one in requirements(scored)}
+def values(*goals):
+    scored = [_score_task(BUILDING, task, "room 1") for task in goals]
+    return {task.name: (task.value, task.is_met) for task in requirements(scored)}
 
 
-def test_an_errand_reaches_its_place_where_the_pilot_says_so_and_the_robot_is_there():
-    found = values(ran((3.0, 4.2)))
+def test_a_task_reaches_its_place_if_the_pilot_reports_it_and_the_robot_is_there():
+    found = values(run((3.0, 4.2)))
     assert all(met for _, met in found.values())
     assert found["mean speed"][0] == pytest.approx(0.49)
-    for bad in (ran((3.0, 4.4)), ran((3.0, 4.0), "go room 1: given up after 300 s")):
-        assert values(ran((3.0, 4.0)), bad)["errands that reach their place"] == (0.5, False)
-    assert values(ran((3.0, 4.0), contacts=1))["contacts"] == (1.0, False)
+    for bad in (run((3.0, 4.4)), run((3.0, 4.0), "go room 1: given up after 300 s")):
+        assert values(run((3.0, 4.0)), bad)["tasks that reach their place"] == (0.5, False)
+    assert values(run((3.0, 4.0), contacts=1))["contacts"] == (1.0, False)
 
 
-def test_what_slam_is_told_is_compared_in_the_frame_of_the_area():
-    scored = _scored(BUILDING, ran((3.0, 4.0), told=(0.3, -0.4, 0.1)), "room 1")
+def test_initial_poses_are_compared_in_the_frame_of_the_area():
+    scored = _score_task(BUILDING, run((3.0, 4.0), offset=(0.3, -0.4, 0.1)), "room 1")
     assert scored.starts == [(pytest.approx(0.5), pytest.approx(0.1))]
-    assert _row(scored)[-2:] == ["0.50", "5.7"]
-    assert not values(ran((3.0, 4.0), told=(0.3, -0.4, 0.1)))["initialpose: largest error"][1]
+    assert [cell(scored) for _, cell in _COLUMNS[-2:]] == ["0.50", "5.7"]
+    assert not values(run((3.0, 4.0), offset=(0.3, -0.4, 0.1)))["initialpose: largest error"][1]
 
 
-def test_the_robot_wakes_up_at_the_same_place_for_the_same_building():
-    first, second = (_awakening(WORLD, np.random.default_rng([0, 3])) for _ in range(2))
+def test_the_robot_starts_at_the_same_place_for_the_same_building():
+    first, second = (_draw_start(WORLD, np.random.default_rng([0, 3])) for _ in range(2))
     assert first == second
 
 
 def test_the_document_has_a_place_for_it():
     text = VALIDATION.read_text()
-    assert all(text.count(mark) == 1 for mark in marks("pilot"))
+    assert all(text.count(mark) == 1 for mark in document_marks("pilot"))

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from benchmark.policies import requirements, share
+from benchmark.policies import requirements, share_within
 from benchmark.simulated.truth import crossings_of, doors_of
-from benchmark.simulated.watch import watched
+from benchmark.simulated.watch import observe_world
 from benchmark.simulated.worlds import INSTITUTE, World
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.simulation import open_simulated
@@ -20,7 +20,7 @@ def test_a_robot_that_enters_rooms_passes_their_doors_in_their_middle(world):
     scenario = open_simulated(world.log).scenario
     doors = doors_of(scenario.building)
     path = scenario.poses[:, :2]
-    passed = doors.passed(path)
+    passed = doors.select_passed(path)
     rooms = scenario.building.rooms
     inside = [
         bool((np.abs(se2.transform(se2.inverse(room[:3]), path)) <= 0.5 * room[3:] - 0.5).all(axis=1).any())
@@ -34,11 +34,11 @@ def test_a_robot_that_enters_rooms_passes_their_doors_in_their_middle(world):
 def test_an_institute_has_crossings_as_wide_as_their_hallways():
     scenario = open_simulated(World(INSTITUTE, 3).log).scenario
     crossings = crossings_of(scenario.building)
-    assert len(crossings.passed(scenario.poses[:, :2]).poses) == len(crossings.poses) == 4
+    assert len(crossings.select_passed(scenario.poses[:, :2]).poses) == len(crossings.poses) == 4
     middle, half = crossings.middles[:1], crossings.halves[0]
     assert 0.8 < half < 1.3
-    np.testing.assert_allclose(crossings.apart(middle + np.array([0.3, 0.0]))[0], 0.0)
-    np.testing.assert_allclose(crossings.apart(middle + np.array([0.0, 3.0]))[0], 3.0 - half)
+    np.testing.assert_allclose(crossings.distances(middle + np.array([0.3, 0.0]))[0], 0.0)
+    np.testing.assert_allclose(crossings.distances(middle + np.array([0.0, 3.0]))[0], 3.0 - half)
 
 
 def record(doors, portals, wrong=0, error=0.1):
@@ -52,21 +52,21 @@ def record(doors, portals, wrong=0, error=0.1):
 
 def test_what_is_near_counts_and_what_is_nowhere_does_not():
     own = [record([0.2, None], [0.1, 0.6]), record([1.5], [])]
-    assert share(own, "doors", 1.0) == pytest.approx(1 / 3)
-    assert share(own, "portals", 0.5) == pytest.approx(0.5)
-    assert math.isnan(share([record([], [])], "doors", 1.0))
+    assert share_within(own, "doors", 1.0) == pytest.approx(1 / 3)
+    assert share_within(own, "portals", 0.5) == pytest.approx(0.5)
+    assert math.isnan(share_within([record([], [])], "doors", 1.0))
 
 
-def test_a_policy_is_judged_by_doors_closures_and_the_error_by_ncut():
+def test_a_policy_is_scored_by_doors_closures_and_the_error_by_ncut():
     good, bad = record([0.2], [0.1], error=0.105), record([2.0], [1.0], wrong=1, error=0.2)
     met = {"both": [good], "other": [bad], "ncut": [record([None], [])]}
-    assert [one.met for one in requirements("both", met)] == [True] * 5
-    assert [one.met for one in requirements("other", met)] == [False, False, False, True, False]
+    assert [one.is_met for one in requirements("both", met)] == [True] * 5
+    assert [one.is_met for one in requirements("other", met)] == [False, False, False, True, False]
 
 
 @pytest.mark.parametrize(("policy", "found"), [("ncut", False), ("both", True)])
-def test_areas_end_at_the_doors_that_a_robot_passes_where_they_are_asked_to(policy, found):
-    doors = watched(OFFICE, (f"aam.area_policy={policy}",))["doors"]
+def test_areas_end_at_the_doors_that_a_robot_passes_where_they_have_to(policy, found):
+    doors = observe_world(OFFICE, (f"aam.area_policy={policy}",))["doors"]
     assert len(doors["doors"]) == 1
     assert [distance <= 1.0 for distance in doors["doors"]] == [found]
     assert [distance <= 0.5 for distance in doors["doors_portals"]] == [found]

@@ -1,4 +1,4 @@
-"""Reports, the tables in the documents, the logs that are measured on, and what a run is said to cost."""
+"""Reports, the tables in the documents, the logs that are measured on, and what a run costs."""
 
 import json
 import lzma
@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from benchmark.logs import ROOT, missing, opened
-from benchmark.report import ACCURACY, Report, Requirement, marks, write_between_marks
+from benchmark.logs import ROOT, open_logs, reason_missing
+from benchmark.report import ACCURACY, Report, Requirement, document_marks, write_between_marks
 from hmt_slam_ros.errors import HmtSlamError
 
 
@@ -27,11 +27,11 @@ def test_a_report_is_complete_as_text_and_for_programs(tmp_path):
 
 def test_logs_are_decompressed_and_vanish(tmp_path, monkeypatch):
     monkeypatch.setenv("HMT_SLAM_DATASETS", str(tmp_path))
-    assert "aces.clf.xz is not in" in missing("aces")
+    assert "aces.clf.xz is not in" in reason_missing("aces")
     for name, text in (("aces.clf.xz", "# a log\n"), ("aces.relations.xz", "1 2 3 0 0 0 0 0\n")):
         (tmp_path / name).write_bytes(lzma.compress(text.encode()))
-    assert not missing("aces")
-    with opened(["aces", "malaga"]) as (aces, malaga):
+    assert not reason_missing("aces")
+    with open_logs(["aces", "malaga"]) as (aces, malaga):
         assert aces.path.read_text() == "# a log\n"
         assert aces.relations.poses.tolist() == [[3.0, 0.0, 0.0]]
         assert malaga.relations is None
@@ -42,7 +42,7 @@ def test_logs_are_decompressed_and_vanish(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("name", "words"), [("mars", "choose from aces"), ("intel", "set HMT_SLAM_DATASETS")])
 def test_a_log_that_is_not_there_is_named_with_the_remedy(tmp_path, monkeypatch, name, words):
     monkeypatch.setenv("HMT_SLAM_DATASETS", str(tmp_path))
-    with pytest.raises(HmtSlamError, match=words), opened([name]):
+    with pytest.raises(HmtSlamError, match=words), open_logs([name]):
         pass
 
 
@@ -59,7 +59,7 @@ def test_the_memory_of_a_program_is_not_that_of_the_one_that_starts_it():
 
 def test_tables_are_written_between_their_marks_and_nowhere_else(tmp_path):
     document = tmp_path / "document.md"
-    (begin, end), (other, _) = marks("speed"), marks("sessions")
+    (begin, end), (other, _) = document_marks("speed"), document_marks("sessions")
     document.write_text(f"before\n{begin}\nold\n{end}\nafter\n")
     write_between_marks(document, "speed", "| new |")
     assert document.read_text() == f"before\n{begin}\n| new |\n{end}\nafter\n"
@@ -71,4 +71,4 @@ def test_tables_are_written_between_their_marks_and_nowhere_else(tmp_path):
 @pytest.mark.parametrize("kind", ["accuracy", "robustness", "sessions", "speed"])
 def test_the_document_has_a_place_for_every_measurement(kind):
     text = ACCURACY.read_text()
-    assert all(text.count(mark) == 1 for mark in marks(kind))
+    assert all(text.count(mark) == 1 for mark in document_marks(kind))

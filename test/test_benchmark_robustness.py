@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from benchmark.logs import BUNDLED, opened
-from benchmark.robustness import Verdict, closure_errors, verdict
+from benchmark.logs import BUNDLED, open_logs
+from benchmark.robustness import TopologyVerdict, closure_errors, judge_run
 from benchmark.runs import Case, Runner
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
@@ -50,7 +50,7 @@ def test_a_true_arc_has_no_error_in_any_frame(world):
     assert error.rotation == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_error_of_an_arc_is_told_where_its_areas_meet():
+def test_the_error_of_an_arc_is_reported_where_its_areas_meet():
     """Turned about the place where keyframes 0 and 3 meet, the arc is wrong by that turn alone."""
     meeting = np.array([0.3, 0.1, 0.0])
     turned = se2.compose(se2.compose(meeting, [0.0, 0.0, 0.2]), se2.between(meeting, np.array(TRUTH[2])))
@@ -59,35 +59,35 @@ def test_the_error_of_an_arc_is_told_where_its_areas_meet():
     assert error.rotation == pytest.approx(np.degrees(0.2))
 
 
-def test_arcs_that_closed_no_loop_are_not_judged():
+def test_arcs_that_closed_no_loop_are_not_scored():
     assert errors_of(saved_map(TRUE_ARC + 3.0, closure=False)) == []
 
 
 def scores(error):
-    """One relation over 100 s, wrong by some metres."""
+    """One relation over 100 s, wrong by some meters."""
     stamps = np.array([0, 100_000_000_000])
     trajectory = StampedPoses(stamps, np.array([[0.0, 0.0, 0.0], [10.0 + error, 0.0, 0.0]]))
     return evaluate_relations(trajectory, Relations(stamps[:1], stamps[1:], np.array([[10.0, 0.0, 0.0]])))
 
 
-def moved(x, turn=0.0):
+def errors_of_shift(x, turn=0.0):
     return tuple(errors_of(saved_map(se2.compose(np.array([x, 0.0, turn]), TRUE_ARC))))
 
 
-def test_a_map_of_the_right_topology_is_told_from_wrong_ones():
-    assert Verdict(scores(0.3), moved(0.1)).right
-    assert Verdict(scores(0.3)).right
-    assert not Verdict(scores(1.1), moved(0.1)).right
-    assert not Verdict(scores(0.3), moved(0.6)).right
-    assert not Verdict(scores(0.3), moved(0.0, np.radians(11.0))).right
-    assert not Verdict(scores(0.3), (*moved(0.0), *moved(3.0))).right
-    assert not Verdict(scores(float("nan")), moved(0.0)).right
-    assert not Verdict(None).right
+def test_a_map_of_the_right_topology_is_distinguished_from_wrong_ones():
+    assert TopologyVerdict(scores(0.3), errors_of_shift(0.1)).is_right
+    assert TopologyVerdict(scores(0.3)).is_right
+    assert not TopologyVerdict(scores(1.1), errors_of_shift(0.1)).is_right
+    assert not TopologyVerdict(scores(0.3), errors_of_shift(0.6)).is_right
+    assert not TopologyVerdict(scores(0.3), errors_of_shift(0.0, np.radians(11.0))).is_right
+    assert not TopologyVerdict(scores(0.3), (*errors_of_shift(0.0), *errors_of_shift(3.0))).is_right
+    assert not TopologyVerdict(scores(float("nan")), errors_of_shift(0.0)).is_right
+    assert not TopologyVerdict(None).is_right
 
 
-def test_runs_with_degraded_odometry_are_judged_and_a_failed_one_is_wrong(tmp_path):
+def test_runs_with_degraded_odometry_are_scored_and_a_failed_one_is_wrong(tmp_path):
     """Real runs of the beginning of the bundled log; the path of the first is taken for the truth."""
-    with opened([BUNDLED]) as (bundled,):
+    with open_logs([BUNDLED]) as (bundled,):
         relations = tmp_path / "relations"
         log = replace(bundled, relations_file=relations)
         runner = Runner(tmp_path / "runs", jobs=1)
@@ -98,8 +98,8 @@ def test_runs_with_degraded_odometry_are_judged_and_a_failed_one_is_wrong(tmp_pa
         path = read_tum(reference.folder / "trajectory.tum")
         last = se2.between(path.poses[0], path.poses[-1])
         relations.write_text(f"{path.stamps[0] / 1e9} {path.stamps[-1] / 1e9} {last[0]} {last[1]} 0 0 0 {last[2]}\n")
-        assert verdict(reference, reference).scores.overall.translation.max == pytest.approx(0.0, abs=1e-6)
-        assert verdict(degraded, reference).scores.overall.translation.max > 1e-4
-        assert verdict(failed, reference) == Verdict(None)
+        assert judge_run(reference, reference).scores.overall.translation.max == pytest.approx(0.0, abs=1e-6)
+        assert judge_run(degraded, reference).scores.overall.translation.max > 1e-4
+        assert judge_run(failed, reference) == TopologyVerdict(None)
         with pytest.raises(HmtSlamError, match="no such kind"):
             runner.runs([failed.case])

@@ -1,12 +1,12 @@
-"""The lattices that scale is measured in, the robot that leaves them and comes back, and what is asked for."""
+"""The lattices that scale is measured in, the robot that leaves them and comes back, and the requirements."""
 
 import numpy as np
 import pytest
 
-from benchmark.lattice import FIRST_KEYFRAME, PER_AREA, SPACING, Lattice, LatticeScans, scan_at, stops
-from benchmark.report import VALIDATION, marks
+from benchmark.lattice import FIRST_KEYFRAME, PER_AREA, SPACING, Lattice, LatticeScans, make_stops, scan_at
+from benchmark.report import VALIDATION, document_marks
 from benchmark.scale import Cut, cost_of_scans, cut_requirement, growth_requirement, measured_cuts
-from benchmark.scale_maps import lasting, state_of, stored
+from benchmark.scale_maps import state_of, time_saving, weigh_areas
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.process_table import process_names
@@ -32,7 +32,7 @@ def test_the_shared_scans_are_those_of_the_keyframes_poses():
 
 
 def test_a_way_stops_at_even_distances_and_looks_ahead():
-    way = list(stops([(0, 0), (1, 0), (1, -1)]))
+    way = list(make_stops([(0, 0), (1, 0), (1, -1)]))
     assert np.allclose(np.diff([stop.pose[0] for stop in way[:5]]), 1.6)
     assert [stop.last for stop in way] == 2 * [False, False, False, False, True]
     assert np.allclose(way[5].pose, [SPACING, -SPACING + 3.2, -0.5 * np.pi])
@@ -54,25 +54,25 @@ def test_a_scan_has_a_cost_in_every_process():
 
 
 def test_what_a_stored_area_takes_is_poses_arcs_and_scans():
-    area = stored(Lattice(10, 10))
+    area = weigh_areas(Lattice(10, 10))
     assert 1.0 < area.graph < 8.0
     assert PER_AREA * 4 * 181 / 1e3 < area.scans < 20.0
     assert area.whole == area.graph + area.scans
 
 
-def test_the_longest_cut_and_the_growth_of_a_scans_cost_are_judged():
+def test_the_longest_cut_and_the_growth_of_a_scans_cost_are_scored():
     cuts = [Cut(30.0, 0, 1, 0.0), Cut(101.0, 3, 2, 0.0)]
-    assert not cut_requirement(10_000, cuts).met
-    assert cut_requirement(100_000, cuts).met
+    assert not cut_requirement(10_000, cuts).is_met
+    assert cut_requirement(100_000, cuts).is_met
     scans = {10: {"slam": 1.0, "rtl": 1.0}, 1000: {"slam": 1.09, "rtl": 1.2}}
-    assert growth_requirement("slam", scans).met
-    assert not growth_requirement("rtl", scans).met
+    assert growth_requirement("slam", scans).is_met
+    assert not growth_requirement("rtl", scans).is_met
 
 
 @pytest.mark.parametrize("kind", ["scale"])
 def test_the_document_has_a_place_for_the_tables(kind):
     text = VALIDATION.read_text()
-    assert all(text.count(mark) == 1 for mark in marks(kind))
+    assert all(text.count(mark) == 1 for mark in document_marks(kind))
 
 
 def test_a_map_is_saved_and_loaded_with_all_that_was_mapped():
@@ -84,8 +84,8 @@ def test_a_map_is_saved_and_loaded_with_all_that_was_mapped():
         == 12 * PER_AREA
     )
     assert len({scan.ranges.tobytes() for scan in state.processes["tlca"].replica.scans.values()}) == 12 * PER_AREA
-    saved = lasting(Lattice(4, 3), Configuration())
+    saved = time_saving(Lattice(4, 3), Configuration())
     assert saved.areas == 12
     assert saved.megabytes > 12 * PER_AREA * 181 * 4 / 1e6
-    assert saved.look > 0.0
+    assert saved.load_map > 0.0
     assert saved.whole == saved.save + saved.load > 0.0

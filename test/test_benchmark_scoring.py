@@ -1,4 +1,4 @@
-"""Scoring from output folders: what is asked for is met by good trajectories, and missed by bad ones."""
+"""Scoring from output folders: requirements are met by good trajectories, and missed by bad ones."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ SECONDS = np.arange(0.0, 200.0, 1.0)
 
 
 def line(error=0.0):
-    """A drive along x at 1 m/s, whose every metre is too long by ``error``."""
+    """A drive along x at 1 m/s, whose every meter is too long by ``error``."""
     poses = np.stack([(1.0 + error) * SECONDS, 0.0 * SECONDS, 0.0 * SECONDS], axis=1)
     return StampedPoses((SECONDS * 1e9).astype(np.int64), poses)
 
@@ -58,7 +58,7 @@ def test_means_over_seeds_by_hand(tmp_path, log):
     assert means.worst == pytest.approx(1.65)
     assert means.long == pytest.approx(2.0)
     assert means.long_max == pytest.approx(3.0)
-    assert (means.matched, means.carried, means.missed) == (1.0, 0, 0)
+    assert (means.matched, means.extrapolated, means.missed) == (1.0, 0, 0)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_each_requirement_fails_on_its_own_figure(tmp_path, log, change, unmet):
     means = over_seeds([score(folder_with(tmp_path, "run", trajectory=line()), log)])
     good = replace(means, translation=0.04, rotation=0.4, long=0.06, worst=0.05)
     requirements = accuracy_requirements("aces", replace(good, **change))
-    failed = [requirement.name for requirement in requirements if not requirement.met]
+    failed = [requirement.name for requirement in requirements if not requirement.is_met]
     assert len(failed) == len(unmet)
     assert all(part in name for part, name in zip(unmet, failed, strict=True))
     assert ("| FAIL |" in Report("accuracy", "", requirements=requirements).text) == bool(unmet)
@@ -85,11 +85,11 @@ def test_each_requirement_fails_on_its_own_figure(tmp_path, log, change, unmet):
 def test_the_bounds_are_those_that_the_project_promises():
     assert (BOUNDS["aces"].translation, BOUNDS["aces"].rotation) == (0.043, 0.9)
     assert (BOUNDS["intel"].translation, BOUNDS["intel"].rotation) == (0.022, 0.8)
-    asked = speed_requirements("intel", [26.0, 23.0], [350 * 10**6])
-    assert [(one.name, one.met) for one in asked] == [("intel: CPU time", True), ("intel: peak memory", True)]
-    assert not speed_requirements("intel", [26.0, 25.0], [1])[0].met
-    assert not speed_requirements("intel", [1.0], [1, 351 * 10**6])[1].met
-    assert not speed_requirements("aces", [15.1], [1])[0].met
+    query = speed_requirements("intel", [26.0, 23.0], [350 * 10**6])
+    assert [(one.name, one.is_met) for one in query] == [("intel: CPU time", True), ("intel: peak memory", True)]
+    assert not speed_requirements("intel", [26.0, 25.0], [1])[0].is_met
+    assert not speed_requirements("intel", [1.0], [1, 351 * 10**6])[1].is_met
+    assert not speed_requirements("aces", [15.1], [1])[0].is_met
 
 
 def test_a_log_without_truth_is_not_scored(tmp_path, log):

@@ -14,15 +14,15 @@ FIGURES = {"aces": {"translation_m": [0.040, 0.042, 0.041, 0.039, 0.043], "relat
 
 
 @pytest.fixture
-def expected(tmp_path):
+def expected_figures(tmp_path):
     write_expected(tmp_path / "expected.toml", FIGURES)
     return read_expected(tmp_path / "expected.toml")
 
 
-def test_what_is_written_is_read(expected):
-    assert expected["aces"]["translation_m"].mean == pytest.approx(0.041)
-    assert expected["aces"]["translation_m"].std == pytest.approx(0.00158, abs=1e-5)
-    assert expected["aces"]["relations_missed"] == Expected(0.0, 0.0, seeds=5)
+def test_what_is_written_is_read(expected_figures):
+    assert expected_figures["aces"]["translation_m"].mean == pytest.approx(0.041)
+    assert expected_figures["aces"]["translation_m"].std == pytest.approx(0.00158, abs=1e-5)
+    assert expected_figures["aces"]["relations_missed"] == Expected(0.0, 0.0, seeds=5)
 
 
 def test_the_bound_is_four_standard_errors_above_the_mean():
@@ -30,10 +30,10 @@ def test_the_bound_is_four_standard_errors_above_the_mean():
     assert Expected(1.0, 0.001, seeds=10).bound(10) == pytest.approx(1.02)
 
 
-def test_the_same_figures_pass_and_others_within_the_noise_too(expected):
-    assert all(r.met for r in regressions("aces", FIGURES["aces"], expected["aces"]))
+def test_the_same_figures_pass_and_others_within_the_noise_too(expected_figures):
+    assert all(r.is_met for r in regressions("aces", FIGURES["aces"], expected_figures["aces"]))
     other = {"translation_m": [0.043, 0.044], "relations_missed": [0.0, 0.0]}
-    assert all(r.met for r in regressions("aces", other, expected["aces"]))
+    assert all(r.is_met for r in regressions("aces", other, expected_figures["aces"]))
 
 
 @pytest.mark.parametrize(
@@ -44,15 +44,15 @@ def test_the_same_figures_pass_and_others_within_the_noise_too(expected):
         {"translation_m": [0.041, float("nan")], "relations_missed": [0.0, 0.0]},
     ],
 )
-def test_a_figure_that_became_worse_fails(expected, worse):
-    assert [r.met for r in regressions("aces", worse, expected["aces"])].count(False) == 1
+def test_a_figure_that_became_worse_fails(expected_figures, worse):
+    assert [r.is_met for r in regressions("aces", worse, expected_figures["aces"])].count(False) == 1
 
 
-def test_a_figure_of_which_nothing_is_expected_is_no_pass(expected):
+def test_a_figure_of_which_nothing_is_expected_is_no_pass(expected_figures):
     with pytest.raises(HmtSlamError, match="--write-expected"):
-        regressions("aces", {**FIGURES["aces"], "new": [1.0]}, expected["aces"])
+        regressions("aces", {**FIGURES["aces"], "new": [1.0]}, expected_figures["aces"])
     with pytest.raises(HmtSlamError, match="relations_missed"):
-        regressions("aces", {"translation_m": [0.041]}, expected["aces"])
+        regressions("aces", {"translation_m": [0.041]}, expected_figures["aces"])
 
 
 def test_something_is_expected_of_every_part():
@@ -73,7 +73,9 @@ def test_a_regression_of_the_bundled_log_fails_the_command(tmp_path, monkeypatch
     monkeypatch.setattr(short, "PARTS", (Part("malaga", 0.0, 1), *PARTS[1:]))
     assert main(["short", "--out", str(tmp_path / "report")]) == 1
     requirements = json.loads((tmp_path / "report" / "short.json").read_text())["requirements"]
-    assert [asked["name"] for asked in requirements if not asked["met"]] == ["malaga: disagreement, mean of 1"]
+    assert [requirement["name"] for requirement in requirements if not requirement["met"]] == [
+        "malaga: disagreement, mean of 1"
+    ]
     assert len(requirements) == 4
     assert "Skipped aces: aces.clf.xz is not in" in (tmp_path / "report" / "short.md").read_text()
 

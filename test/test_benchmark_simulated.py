@@ -1,4 +1,4 @@
-"""What is true of a simulated run: claims, loops, and that watching a run changes nothing of it."""
+"""What is true of a simulated run: placements, loops, and that watching a run changes nothing of it."""
 
 import csv
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmark.simulated.loops import Loops
-from benchmark.simulated.records import Records, code, read_record, write_comparisons
+from benchmark.simulated.records import Records, code_hash, read_record, write_comparisons
 from benchmark.simulated.truth import Truth, nees
 from benchmark.simulated.worlds import FAMILIES, LONG, SETTINGS, World, seeds
 from hmt_slam_ros.configuration import load_configuration
@@ -24,11 +24,11 @@ TIGHT = 1e-4 * np.eye(3)
 
 
 def keyframes_of(log, spacing=10):
-    """Keyframe events of every so many scans of a drive, without leaves."""
+    """Keyframe events of every so many scans of a drive, without hypotheses."""
     scans = [r.measurement for r in log.records() if isinstance(r.measurement, Scan)][::spacing]
     path = log.true_poses(np.array([scan.stamp for scan in scans]))
-    travelled = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
-    return [Keyframe(k, scan, float(way), ()) for k, (scan, way) in enumerate(zip(scans, travelled, strict=True))]
+    traveled = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
+    return [Keyframe(k, scan, float(way), ()) for k, (scan, way) in enumerate(zip(scans, traveled, strict=True))]
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def drive():
     keyframes = keyframes_of(log)
     truth = Truth(log)
     for keyframe in keyframes:
-        truth.note(keyframe)
+        truth.add_keyframe(keyframe)
     return truth, keyframes
 
 
@@ -63,10 +63,10 @@ def second_lap(truth, keyframes):
     return early[int(np.argmin(distances))], late
 
 
-def claim_with_error(truth, known, asked, error, covariance=TIGHT):
-    """The claim that joins the frames of two keyframes, moved by an error."""
-    pose = se2.compose(se2.between(truth.poses[known], truth.poses[asked]), np.array(error))
-    return truth.claim({known: np.zeros(3)}, {asked: pose}, covariance, pose)
+def placement_with_error(truth, known, requirement, error, covariance=TIGHT):
+    """The placement that joins the frames of two keyframes, moved by an error."""
+    pose = se2.compose(se2.between(truth.poses[known], truth.poses[requirement]), np.array(error))
+    return truth.assess({known: np.zeros(3)}, {requirement: pose}, covariance, pose)
 
 
 def test_the_long_world_is_2_km_of_nested_loops_and_no_family():
@@ -75,28 +75,28 @@ def test_the_long_world_is_2_km_of_nested_loops_and_no_family():
     assert LONG not in FAMILIES
 
 
-def test_a_claim_is_true_where_the_places_meet_as_it_says(drive):
+def test_a_placement_is_true_where_the_places_meet(drive):
     truth, keyframes = drive
-    known, asked = second_lap(truth, keyframes)
-    exact = claim_with_error(truth, known, asked, (0.0, 0.0, 0.0))
+    known, requirement = second_lap(truth, keyframes)
+    exact = placement_with_error(truth, known, requirement, (0.0, 0.0, 0.0))
     assert exact.true
-    assert exact.pair == (known, asked)
+    assert exact.pair == (known, requirement)
     assert exact.translation == pytest.approx(0.0, abs=1e-9)
-    assert claim_with_error(truth, known, asked, (0.45, 0.0, 0.1)).true
-    assert not claim_with_error(truth, known, asked, (0.0, 0.0, 0.2)).true
-    # Up to 2 m where the claim says itself that it does not know better.
-    assert not claim_with_error(truth, known, asked, (1.5, 0.0, 0.0)).true
-    assert claim_with_error(truth, known, asked, (1.5, 0.0, 0.0), np.diag([1.0, 0.01, 0.01])).true
-    assert not claim_with_error(truth, known, asked, (2.5, 0.0, 0.0), np.diag([4.0, 0.01, 0.01])).true
+    assert placement_with_error(truth, known, requirement, (0.45, 0.0, 0.1)).true
+    assert not placement_with_error(truth, known, requirement, (0.0, 0.0, 0.2)).true
+    # Up to 2 m where its covariance admits the error.
+    assert not placement_with_error(truth, known, requirement, (1.5, 0.0, 0.0)).true
+    assert placement_with_error(truth, known, requirement, (1.5, 0.0, 0.0), np.diag([1.0, 0.01, 0.01])).true
+    assert not placement_with_error(truth, known, requirement, (2.5, 0.0, 0.0), np.diag([4.0, 0.01, 0.01])).true
 
 
-def test_a_claim_that_joins_what_is_apart_is_false_however_right_its_pose(drive):
+def test_a_placement_that_joins_what_is_apart_is_false_however_right_its_pose(drive):
     truth, keyframes = drive
     far = next(k.sequence for k in keyframes if k.path_length > 20.0)
-    claim = claim_with_error(truth, 0, far, (0.0, 0.0, 0.0))
-    assert claim.translation == pytest.approx(0.0, abs=1e-9)
-    assert not claim.same_place
-    assert not claim.true
+    placement = placement_with_error(truth, 0, far, (0.0, 0.0, 0.0))
+    assert placement.translation == pytest.approx(0.0, abs=1e-9)
+    assert not placement.same_place
+    assert not placement.true
 
 
 def test_a_loop_is_found_where_the_second_lap_begins_and_closed_where_the_map_joins_it(drive):
@@ -106,12 +106,12 @@ def test_a_loop_is_found_where_the_second_lap_begins_and_closed_where_the_map_jo
         area = 0 if keyframe.path_length < 28.0 else 1
         for hybrid_map in (separate, joined):
             hybrid_map.set_keyframe(keyframe.sequence, 2 * area, truth.poses[keyframe.sequence])
-        loops.note(keyframe.sequence, keyframe.path_length, separate, 2 * area)
+        loops.add_event(keyframe.sequence, keyframe.path_length, separate, 2 * area)
         if keyframe.path_length > 60.0 and joined.arc(0, 2) is None:
-            loops.definite(keyframe.sequence, separate, 2)
+            loops.update_definite(keyframe.sequence, separate, 2)
             assert loops.found[-1].closed_at is None
             joined.set_arc(0, 2, PoseGaussian(np.zeros(3), TIGHT), closure=True)
-            loops.definite(keyframe.sequence, joined, 2)
+            loops.update_definite(keyframe.sequence, joined, 2)
     loops.finish()
     (loop,) = loops.found
     assert loop.begin == pytest.approx(54.0, abs=2.0)
@@ -134,7 +134,7 @@ def test_nees_of_draws_from_a_belief_is_that_of_three_degrees_of_freedom():
 def record(tmp_path_factory):
     """A real watched run, in a process of its own."""
     folder = tmp_path_factory.mktemp("records")
-    return folder, Records(folder, 1).of([WORLD], [])[0]
+    return folder, Records(folder, 1).make([WORLD], [])[0]
 
 
 def test_watching_changes_nothing_of_a_run(record):
@@ -150,7 +150,7 @@ def test_watching_changes_nothing_of_a_run(record):
 
 def test_a_record_holds_what_the_four_measurements_need(record):
     _, watched = record
-    assert watched["code"] == code()
+    assert watched["code"] == code_hash()
     assert sum(loop["can_be_closed"] for loop in watched["loops"]) == 1
     assert len(watched["poses"]) > 50
     assert all(pose["map"]["nees"] >= 0.0 for pose in watched["poses"])
@@ -161,14 +161,14 @@ def test_a_record_holds_what_the_four_measurements_need(record):
     assert len(watched["rows"][0]) == len(watched["columns"])
 
 
-def test_a_record_is_made_once_and_anew_for_other_parameters(record):
+def test_a_record_is_made_once_and_again_for_other_parameters(record):
     folder, watched = record
     path = folder / "ring-5.json.gz"
     before = path.stat().st_mtime_ns
-    assert Records(folder, 1).of([WORLD], []) == [watched]
+    assert Records(folder, 1).make([WORLD], []) == [watched]
     assert path.stat().st_mtime_ns == before
     with pytest.raises(HmtSlamError, match=r"ring-5 failed.*no\.such"):
-        Records(folder, 1).of([WORLD], ["no.such=1"])
+        Records(folder, 1).make([WORLD], ["no.such=1"])
     assert read_record(path) == watched
 
 

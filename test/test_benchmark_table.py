@@ -8,7 +8,15 @@ import pytest
 from benchmark.charted_run import OneArea
 from benchmark.logs import MeasuredLog
 from benchmark.runs import Run
-from benchmark.table import Comparison, Entry, KeptRunner, compared, comparison_table, metric_case, requirements
+from benchmark.table import (
+    CachedRunner,
+    Comparison,
+    Entry,
+    comparison_table,
+    metric_case,
+    open_compared_logs,
+    requirements,
+)
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import AreaEvents, Hypotheses
@@ -25,7 +33,7 @@ def method(particles, cpu, peak, long_error, name="metric RBPF", worst=0.5):
 OURS = method(12, 10.0, 200.0, 0.1, "HMT-SLAM")
 
 
-def test_accuracy_is_equal_up_to_a_factor_or_a_centimetre():
+def test_accuracy_is_equal_up_to_a_factor_or_a_centimeter():
     assert method(12, 1.0, 1.0, 0.125).as_accurate_as(OURS)
     assert not method(12, 1.0, 1.0, 0.126).as_accurate_as(OURS)
     assert method(12, 1.0, 1.0, 0.029).as_accurate_as(method(12, 1.0, 1.0, 0.02))
@@ -35,10 +43,10 @@ def test_accuracy_is_equal_up_to_a_factor_or_a_centimetre():
 @pytest.mark.parametrize(
     ("last", "met"), [((100, 40.0, 600.0, 0.1), [True] * 3), ((40, 39.0, 599.0, 0.9), [True, False, False])]
 )
-def test_the_campus_asks_for_ratios_of_the_last_filter_that_was_tried(last, met):
+def test_the_campus_requests_ratios_of_the_last_filter_that_was_tried(last, met):
     found = Comparison(OURS, (method(12, 11.0, 220.0, 1.0), method(*last)), {}, "truth")
-    assert [asked.met for asked in requirements(found)] == met
-    assert ("not as accurate" in requirements(found)[1].name) == (not found.equal)
+    assert [requirement.is_met for requirement in requirements(found)] == met
+    assert ("not as accurate" in requirements(found)[1].name) == (not found.is_equal)
     assert comparison_table({"campus": found}).count("metric RBPF") == 2
 
 
@@ -50,7 +58,7 @@ def test_a_metric_run_has_a_map_that_holds_the_log_and_its_own_particles():
     assert case.name != metric_case(LOG, 3, (), 100).name
 
 
-def test_a_run_is_kept_and_made_anew_for_another_program(tmp_path, monkeypatch):
+def test_a_run_is_kept_and_made_again_for_another_program(tmp_path, monkeypatch):
     runs = []
 
     def run_case(case, folder):
@@ -61,17 +69,17 @@ def test_a_run_is_kept_and_made_anew_for_another_program(tmp_path, monkeypatch):
     monkeypatch.setattr("benchmark.runs.run_case", run_case)
     case = metric_case(LOG, 0, (), 12)
     for _ in range(2):
-        (run,) = KeptRunner(tmp_path, 1).runs([case])
+        (run,) = CachedRunner(tmp_path, 1).runs([case])
         assert (run.cpu_seconds, run.wall_seconds, run.peak_rss) == (5.0, 6.0, 7)
     assert len(runs) == 1
     usage = runs[0] / "usage.json"
     usage.write_text(json.dumps(json.loads(usage.read_text()) | {"code": "older"}))
-    KeptRunner(tmp_path, 1).runs([case])
+    CachedRunner(tmp_path, 1).runs([case])
     assert len(runs) == 2
 
 
 def test_a_name_that_is_no_log_is_refused():
-    with pytest.raises(HmtSlamError, match="there is no log 'atlantis'"), compared(["atlantis"]):
+    with pytest.raises(HmtSlamError, match="there is no log 'atlantis'"), open_compared_logs(["atlantis"]):
         pass
 
 
@@ -82,7 +90,7 @@ def test_with_one_area_nothing_is_ever_left():
     assert all(
         len(message.hypotheses) == 1 for message in recorder.hypotheses.values() if isinstance(message, Hypotheses)
     )
-    assert {leaf.area for message in recorder.hypotheses.values() for leaf in message.hypotheses} == {0}
+    assert {hypothesis.area for message in recorder.hypotheses.values() for hypothesis in message.hypotheses} == {0}
 
 
 def test_one_area_answers_keyframes_alone():

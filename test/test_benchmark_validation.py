@@ -9,21 +9,21 @@ from benchmark.__main__ import main
 from benchmark.calibration import (
     KINDS,
     Forecast,
-    covered,
-    forecast,
+    coverage,
+    forecast_of_arcs,
+    forecast_of_base_rate,
+    forecast_of_hypotheses,
     interval,
+    make_forecast,
     mean_nees,
     new_rate,
-    of_arcs,
-    of_base_rate,
-    of_each,
-    of_hypotheses,
-    of_top,
     reliability,
+    reliability_of_all,
+    reliability_of_top,
 )
-from benchmark.loops import distances, faults, missed_share
-from benchmark.report import VALIDATION, Requirement, marks
-from benchmark.simulated.closures import NEW, NOT_ASKED
+from benchmark.loops import closing_distances, find_faults, missed_share
+from benchmark.report import VALIDATION, Requirement, document_marks
+from benchmark.simulated.closures import NEW, NOT_EXAMINED
 
 
 def answer(area, probability, right):
@@ -31,7 +31,7 @@ def answer(area, probability, right):
 
 
 def test_true_answers_count_as_one_and_what_is_not_examined_is_false():
-    found = forecast([(3, 0.5, True), (4, 0.2, True), (3, 0.1, False), (5, 0.05, False), (5, 0.05, False)])
+    found = make_forecast([(3, 0.5, True), (4, 0.2, True), (3, 0.1, False), (5, 0.05, False), (5, 0.05, False)])
     assert found.right == pytest.approx(0.7)
     np.testing.assert_allclose(sorted(found.wrong), [0.1, 0.1, 0.1])
     assert found.brier == pytest.approx(0.3**2 + 3 * 0.1**2)
@@ -40,7 +40,7 @@ def test_true_answers_count_as_one_and_what_is_not_examined_is_false():
 
 
 def test_a_forecast_without_the_true_answer_is_as_bad_as_can_be_but_finite():
-    found = forecast([(NEW, 1.0, False)])
+    found = make_forecast([(NEW, 1.0, False)])
     assert found.brier == 2.0
     assert found.surprise == pytest.approx(-math.log(1e-6))
     assert found.top == (1.0, False)
@@ -48,29 +48,29 @@ def test_a_forecast_without_the_true_answer_is_as_bad_as_can_be_but_finite():
 
 EVENT = {
     "answers": [answer(2, 0.9, True), answer(NEW, 0.1, False)],
-    # Two hypotheses of 0.8 and 0.15, of which the first asked about two areas, and one of 0.05 that did not ask.
+    # Two hypotheses of 0.8 and 0.15, of which the first examined two areas, and one of 0.05 that did not.
     "arcs_alone": [
         answer(NEW, 0.4, False),
         answer(2, 0.3, True),
         answer(3, 0.1, False),
         answer(NEW, 0.15, False),
-        answer(NOT_ASKED, 0.05, True),
+        answer(NOT_EXAMINED, 0.05, True),
     ],
 }
 
 
 def test_the_other_forecasters_see_no_scan():
-    assert of_hypotheses(EVENT).right == pytest.approx(0.9)
-    assert of_arcs(EVENT).right == pytest.approx(0.35)
-    base = of_base_rate(EVENT, 0.6)
+    assert forecast_of_hypotheses(EVENT).right == pytest.approx(0.9)
+    assert forecast_of_arcs(EVENT).right == pytest.approx(0.35)
+    base = forecast_of_base_rate(EVENT, 0.6)
     assert base.right == pytest.approx(0.8 * 0.2 + 0.05)
     assert sum(base.wrong) == pytest.approx(1.0 - base.right)
-    # New ground: 60 % of what asked about areas, and all of what had none to ask about.
+    # New ground: 60 % of what examined areas, and all of what had none to examine.
     assert max(base.wrong) == pytest.approx(0.8 * 0.6 + 0.15)
     assert new_rate([EVENT]) == 0.0
 
 
-def calibrated(count, draw):
+def calibrated_forecasts(count, draw):
     """Questions of two answers whose probabilities are right."""
     for p in draw.uniform(0.5, 1.0, count):
         yield Forecast(p, (1.0 - p,)) if draw.random() < p else Forecast(1.0 - p, (p,))
@@ -78,14 +78,14 @@ def calibrated(count, draw):
 
 def test_right_probabilities_have_no_calibration_error_and_too_certain_ones_have():
     draw = np.random.default_rng(2)
-    right = list(calibrated(20_000, draw))
-    assert of_top(right).error < 0.01
-    assert of_each(right).error < 0.01
+    right = list(calibrated_forecasts(20_000, draw))
+    assert reliability_of_top(right).error < 0.01
+    assert reliability_of_all(right).error < 0.01
     certain = [Forecast(float(each.right > 0.5), (float(each.right <= 0.5),)) for each in right]
     # Right in three of four cases on average.
-    assert of_top(certain).error == pytest.approx(0.25, abs=0.01)
-    low, high = interval([right[k : k + 10] for k in range(0, 200, 10)], lambda some: of_top(some).error)
-    assert low < of_top(right[:200]).error < high
+    assert reliability_of_top(certain).error == pytest.approx(0.25, abs=0.01)
+    low, high = interval([right[k : k + 10] for k in range(0, 200, 10)], lambda some: reliability_of_top(some).error)
+    assert low < reliability_of_top(right[:200]).error < high
 
 
 def test_a_reliability_diagram_has_every_answer_in_one_bin():
@@ -115,29 +115,29 @@ def record(loops=(), accepted=(), pending=(), arcs=(), poses=()):
 def test_a_loop_that_is_closed_late_or_never_is_missed():
     records = [record([loop(44.0), loop(None, can_be_closed=False)]), record([loop(70.0), loop(None)])]
     assert missed_share(records) == pytest.approx(2 / 3)
-    assert distances(records) == [4.0]
+    assert closing_distances(records) == [4.0]
     assert math.isnan(missed_share([record()]))
 
 
 def test_a_topology_is_exact_without_false_closures_and_with_every_loop_closed():
-    assert faults(record([loop(70.0), loop(None, can_be_closed=False)], [True], [True])) == []
-    assert faults(record([loop(None)])) == ["loops not closed: 1"]
-    assert faults(record([], [True, False])) == ["closures accepted falsely: 1"]
-    assert faults(record([], [], [False])) == ["false closures pending: 1"]
+    assert find_faults(record([loop(70.0), loop(None, can_be_closed=False)], [True], [True])) == []
+    assert find_faults(record([loop(None)])) == ["loops not closed: 1"]
+    assert find_faults(record([], [True, False])) == ["closures accepted falsely: 1"]
+    assert find_faults(record([], [], [False])) == ["false closures pending: 1"]
 
 
 def test_every_run_counts_the_same_for_the_mean_nees():
     records = [record(arcs=[2.0, 4.0]), record(arcs=[9.0]), record()]
     assert mean_nees(records, KINDS["arcs"]) == pytest.approx(6.0)
-    assert covered(records, KINDS["arcs"]) == pytest.approx(2 / 3)
+    assert coverage(records, KINDS["arcs"]) == pytest.approx(2 / 3)
     assert math.isnan(mean_nees(records, KINDS["arcs that closed a loop"]))
-    assert math.isnan(covered(records, KINDS["poses of areas"]))
+    assert math.isnan(coverage(records, KINDS["poses of areas"]))
 
 
 def test_a_figure_may_be_too_small():
     assert Requirement("NEES", 3.0, 4.5, least=2.0).row[2:] == ["2 to 4.5", "pass"]
-    assert not Requirement("NEES", 1.9, 4.5, least=2.0).met
-    assert not Requirement("NEES", math.nan, 4.5, least=2.0).met
+    assert not Requirement("NEES", 1.9, 4.5, least=2.0).is_met
+    assert not Requirement("NEES", math.nan, 4.5, least=2.0).is_met
     assert Requirement("runs", 8, math.inf, least=300).row[2:] == ["at least 300", "FAIL"]
     assert Requirement("error", 0.1, 1.0, "m").row[2:] == ["1 m", "pass"]
 
@@ -145,11 +145,11 @@ def test_a_figure_may_be_too_small():
 @pytest.mark.parametrize("kind", ["calibration", "loops", "topology", "consistency"])
 def test_the_document_has_a_place_for_every_measurement(kind):
     text = VALIDATION.read_text()
-    assert all(text.count(mark) == 1 for mark in marks(kind))
+    assert all(text.count(mark) == 1 for mark in document_marks(kind))
 
 
 def test_all_is_measured_on_a_world_of_the_training_seeds(tmp_path, capsys):
-    """Seed 0 of one family: far too few runs for what is asked for, and that is said."""
+    """Seed 0 of one family: far too few runs for the requirements, which is reported."""
     out, runs = tmp_path / "report", tmp_path / "runs"
     options = ["--logs", "ring", "--seeds", "1", "--training", "--jobs", "1", "--out", str(out), "--runs", str(runs)]
     assert main(["calibration", "loops", "consistency", *options]) == 1

@@ -1,4 +1,4 @@
-"""Maps that close are told from torn ones, without any truth."""
+"""Maps that close are distinguished from torn ones, without any truth."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from worlds import box, scan_in
 from benchmark.scoring import judge_walls
 from hmt_slam_ros.geometry import se2
 
-ROUND = 24  # poses of one round, a metre apart
+ROUND = 24  # poses of one round, a meter apart
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def test_a_second_round_that_fits_the_first_is_not_torn(ring):
     scans, poses = ring
     walls = judge_walls(scans, poses)
     assert len(walls.stretches) >= 2
-    assert walls.torn == []
+    assert walls.torn_stretches == []
     assert walls.agreement > 0.8
 
 
@@ -38,18 +38,18 @@ def test_a_second_round_beside_the_first_is_torn(ring, shift):
     second = np.arange(len(poses)) >= ROUND
     moved = np.where(second[:, None], se2.compose(np.array(shift), poses), poses)
     walls = judge_walls(scans, moved)
-    assert walls.torn
+    assert walls.torn_stretches
     assert walls.agreement < 0.6
 
 
-def test_the_way_back_to_where_a_torn_stretch_fits_is_told(ring):
+def test_the_way_back_to_where_a_torn_stretch_fits_is_reported(ring):
     scans, poses = ring
     moved = poses + np.where(np.arange(len(poses)) >= ROUND, 0.4, 0.0)[:, None] * [1.0, 0.0, 0.0]
-    (worst, *_) = sorted(judge_walls(scans, moved).torn, key=lambda stretch: -stretch.gain)
+    (worst, *_) = sorted(judge_walls(scans, moved).torn_stretches, key=lambda stretch: -stretch.gain)
     assert worst.shift == pytest.approx(0.4, abs=0.11)
 
 
-def test_new_ground_is_not_judged(ring):
+def test_new_ground_is_not_scored(ring):
     scans, poses = ring
     walls = judge_walls(scans[:ROUND], poses[:ROUND])
     assert walls.stretches == ()

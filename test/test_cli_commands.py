@@ -25,7 +25,7 @@ def hmt_slam(*arguments: object, timeout: float = 120.0) -> subprocess.Completed
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout, check=False)
 
 
-def refused(result: subprocess.CompletedProcess) -> str:
+def error_line(result: subprocess.CompletedProcess) -> str:
     """The one line that a refused command says."""
     assert result.returncode == 2, result.stderr
     assert result.stdout == ""
@@ -90,7 +90,7 @@ def test_version() -> None:
     ],
 )
 def test_a_command_line_that_makes_no_sense_is_refused(arguments: str, words: str) -> None:
-    assert words in refused(hmt_slam(*arguments.split()))
+    assert words in error_line(hmt_slam(*arguments.split()))
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_a_command_line_that_makes_no_sense_is_refused(arguments: str, words: st
 def test_an_impossible_parameter_is_refused_with_advice(
     tmp_path: Path, carmen: Path, command: str, option: str, words: str
 ) -> None:
-    assert words in refused(hmt_slam(command, carmen, "--out", tmp_path / "out", *option.split()))
+    assert words in error_line(hmt_slam(command, carmen, "--out", tmp_path / "out", *option.split()))
     assert sorted(tmp_path.iterdir()) == [carmen]
 
 
@@ -121,7 +121,7 @@ def truncated_mcap(folder: Path) -> Path:
     return log
 
 
-def written(content: str) -> object:
+def write_config(content: str) -> object:
     def write(folder: Path) -> Path:
         log = folder / "log.clf"
         log.write_text(content)
@@ -132,10 +132,10 @@ def written(content: str) -> object:
 
 BAD_LOGS = {
     "no such file": lambda folder: folder / "missing.clf",
-    "an empty file": written(""),
-    "a file of no known format": written("dear diary\n"),
-    "no scans": written("ODOM 0 0 0 0 0 0 1.0 robot 1.0\n" * 5),
-    "a truncated CARMEN file": written((SCAN_LINE.format(x=0, t=1.0) * 3)[:-25]),
+    "an empty file": write_config(""),
+    "a file of no known format": write_config("dear diary\n"),
+    "no scans": write_config("ODOM 0 0 0 0 0 0 1.0 robot 1.0\n" * 5),
+    "a truncated CARMEN file": write_config((SCAN_LINE.format(x=0, t=1.0) * 3)[:-25]),
     "a truncated mcap file": truncated_mcap,
     "an empty folder": lambda folder: folder,
 }
@@ -146,12 +146,12 @@ BAD_LOGS = {
 def test_a_log_that_cannot_be_mapped_is_refused_and_nothing_is_left(tmp_path: Path, command: str, kind: str) -> None:
     (tmp_path / "logs").mkdir()
     log = BAD_LOGS[kind](tmp_path / "logs")
-    refused(hmt_slam(command, log, "--out", tmp_path / "out"))
+    error_line(hmt_slam(command, log, "--out", tmp_path / "out"))
     assert [entry.name for entry in tmp_path.iterdir()] == ["logs"]
 
 
 def test_a_part_of_the_log_without_scans_is_refused(tmp_path: Path, carmen: Path) -> None:
-    refused(hmt_slam("map", carmen, "--out", tmp_path / "out", "--start", 1000))
+    error_line(hmt_slam("map", carmen, "--out", tmp_path / "out", "--start", 1000))
     assert list(tmp_path.iterdir()) == [carmen]
 
 
@@ -161,7 +161,7 @@ def test_an_output_path_that_holds_something_else_is_refused_and_kept(
 ) -> None:
     (tmp_path / obstacle).parent.mkdir(exist_ok=True)
     (tmp_path / obstacle).write_text("precious")
-    assert "choose another --out" in refused(hmt_slam("map", carmen, "--out", tmp_path / "out"))
+    assert "choose another --out" in error_line(hmt_slam("map", carmen, "--out", tmp_path / "out"))
     assert (tmp_path / obstacle).read_text() == "precious"
 
 
@@ -231,7 +231,7 @@ def test_convert_says_what_it_wrote(tmp_path: Path, carmen: Path) -> None:
     assert result.returncode == 0, result.stderr
     assert "20 scans, 19.0 s" in result.stdout
     assert (tmp_path / "bag" / "metadata.yaml").is_file()
-    refused(hmt_slam("convert", carmen, tmp_path / "bag"))
+    error_line(hmt_slam("convert", carmen, tmp_path / "bag"))
 
 
 def test_evaluate_prints_the_errors_of_a_trajectory(tmp_path: Path) -> None:
@@ -241,12 +241,12 @@ def test_evaluate_prints_the_errors_of_a_trajectory(tmp_path: Path) -> None:
     assert result.returncode == 0, result.stderr
     assert "0.250" in result.stdout
     assert "over 60 s" in result.stdout
-    refused(hmt_slam("evaluate", tmp_path, "--relations", tmp_path / "missing"))
+    error_line(hmt_slam("evaluate", tmp_path, "--relations", tmp_path / "missing"))
 
 
 @pytest.mark.parametrize("command", ["plot", "export"])
 def test_plot_and_export_of_something_else_are_refused(tmp_path: Path, command: str) -> None:
-    refused(hmt_slam(command, tmp_path))
+    error_line(hmt_slam(command, tmp_path))
 
 
 def test_parameters_prints_a_file_that_config_reads_back(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ def run(tty: bool, seconds_per_scan: float, scans: int = 100) -> str:
     return stream.getvalue()
 
 
-def test_a_short_run_into_a_file_says_nothing() -> None:
+def test_a_short_run_into_a_file_prints_nothing() -> None:
     assert run(tty=False, seconds_per_scan=0.09) == ""
 
 
@@ -55,7 +55,7 @@ def test_the_moving_line_is_not_drawn_for_every_scan_of_a_fast_run() -> None:
     assert run(tty=True, seconds_per_scan=0.001, scans=1000).count("\r") <= 12
 
 
-def test_minutes_are_told_apart() -> None:
+def test_minutes_are_distinct() -> None:
     assert run(tty=False, seconds_per_scan=5.0, scans=20).startswith("2/20 scans, 2.0 x real time, 1 min 30 s left")
 
 

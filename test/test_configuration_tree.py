@@ -213,7 +213,7 @@ def test_a_setting_without_an_equals_sign_is_refused() -> None:
         "/**:\n  ros__parameters: {filter.particles: 30}\nslam:\n  ros__parameters: {filter: {particles: 30}}\n",
     ],
 )
-def test_plain_and_ros_files_say_the_same(tmp_path: Path, text: str) -> None:
+def test_plain_and_ros_files_are_equivalent(tmp_path: Path, text: str) -> None:
     file = tmp_path / "some.yaml"
     file.write_text(text)
     assert load_configuration(file) == with_changes(Configuration(), {"filter.particles": 30})

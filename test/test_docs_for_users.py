@@ -19,7 +19,7 @@ FOR_USERS = (*(f"docs/guides/{name}.md" for name in GUIDES), "docs/reference/par
 ALL = ["README.md", *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md"))]
 # So that the test takes seconds, these see a part of their log, and what test_nodes_replay does is not done once more.
 SHORTENED = {"map sim": ["--duration", "40"]}
-NAMES = {leaf.name for leaf in flat_parameters(Configuration())}
+NAMES = {hypothesis.name for hypothesis in flat_parameters(Configuration())}
 GROUPS = {name.partition(".")[0] for name in NAMES if "." in name}
 
 
@@ -28,7 +28,7 @@ def commands(text):
     return re.findall(r"^    (hmt_slam .*)$", text, re.MULTILINE)
 
 
-def shortened(command):
+def shorten(command):
     return next((more for begin, more in SHORTENED.items() if command.startswith(f"hmt_slam {begin}")), [])
 
 
@@ -36,15 +36,15 @@ def test_every_command_of_the_tutorial_does_what_the_tutorial_says(tmp_path, mon
     (tmp_path / "data").symlink_to(ROOT / "data")
     monkeypatch.chdir(tmp_path)
     assert len(commands(TUTORIAL)) >= 8
-    said = []
+    messages = []
     for command in commands(TUTORIAL):
         if command.startswith("hmt_slam replay"):
             build_parser().parse_args(shlex.split(command)[1:])
             continue
-        assert main([*shlex.split(command)[1:], *shortened(command)]) == 0, command
-        said += capsys.readouterr().out.splitlines()
+        assert main([*shlex.split(command)[1:], *shorten(command)]) == 0, command
+        messages += capsys.readouterr().out.splitlines()
     for shown in re.findall(r"^    ((?!hmt_slam|ros2|\.\.\.).*)$", TUTORIAL, re.MULTILINE):
-        assert any(line.startswith(shown.removesuffix("...")) for line in said), shown
+        assert any(line.startswith(shown.removesuffix("...")) for line in messages), shown
     for path in re.findall(r"`(output/[^`]+)`", TUTORIAL):
         assert (tmp_path / path).exists(), path
     for name in ("pmf.png", "cost.png", "trajectory.tum", "report.json"):
@@ -63,8 +63,8 @@ def test_every_value_that_the_tuning_guide_proposes_is_possible():
     proposed = re.findall(r"`([a-z_]+\.[a-z_]+)`(?: \(|: | )(\d+(?:\.\d+)?)", TUNING)
     assert len(proposed) >= 12
     for name, value in proposed:
-        (leaf,) = (leaf for leaf in flat_parameters(Configuration()) if leaf.name == name)
-        load_configuration(None, [f"{name}={leaf.kind(float(value))}"], None)
+        (hypothesis,) = (hypothesis for hypothesis in flat_parameters(Configuration()) if hypothesis.name == name)
+        load_configuration(None, [f"{name}={hypothesis.kind(float(value))}"], None)
 
 
 @pytest.mark.parametrize("document", FOR_USERS)

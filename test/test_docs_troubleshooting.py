@@ -31,7 +31,7 @@ def wording(node):
     return None
 
 
-def said(tree):
+def call_sentences(tree):
     """Of calls."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and getattr(node.func, "id", getattr(node.func, "attr", "")) in SAID_BY:
@@ -39,7 +39,7 @@ def said(tree):
             yield max((text for text in texts if text), key=len, default="")
 
 
-def kept(tree):
+def stored_sentences(tree):
     """Of returned values and assignments, if there is a remedy in it."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Return | ast.Assign) and node.value is not None:
@@ -54,9 +54,9 @@ def messages():
     found = set()
     for path in PACKAGE.rglob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        found |= {text for text in said(tree) if len(text.split()) >= FEWEST_WORDS}
+        found |= {text for text in call_sentences(tree) if len(text.split()) >= FEWEST_WORDS}
         if not OTHER & set(path.relative_to(PACKAGE).parts):
-            found |= set(kept(tree))
+            found |= set(stored_sentences(tree))
     return sorted(found)
 
 
@@ -83,6 +83,6 @@ def test_every_message_has_an_entry():
 
 
 def test_every_entry_has_a_message():
-    said = messages()
-    stale = [entry for entry in entries() if not any(fits(entry, message) for message in said)]
+    call_sentences = messages()
+    stale = [entry for entry in entries() if not any(fits(entry, message) for message in call_sentences)]
     assert stale == [], "nothing says so any more: take the entries away"

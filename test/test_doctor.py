@@ -41,7 +41,7 @@ def drive():
     return list(open_log(WORLD, duration=70.0).records())
 
 
-def changed(drive, *, scan=lambda scan: scan, odometry=lambda odometry: odometry):
+def change_records(drive, *, scan=lambda scan: scan, odometry=lambda odometry: odometry):
     return Faulty(
         replace(record, measurement=scan(record.measurement) if is_scan(record) else odometry(record.measurement))
         for record in drive
@@ -61,11 +61,11 @@ def text_of(log, subject):
     return next(one.text for one in log_findings(log) if one.subject == subject)
 
 
-def turned(scan, angle, forward=0.0):
+def turn_laser(scan, angle, forward=0.0):
     return replace(scan, laser_pose=scan.laser_pose - np.array([forward, 0.0, angle]))
 
 
-def scaled(drive, *, way=1.0, turn=1.0, between=(0.0, np.inf)):
+def scale_odometry(drive, *, way=1.0, turn=1.0, between=(0.0, np.inf)):
     """Odometry whose increments are scaled, all of them or those of some seconds."""
     readings = [record.measurement for record in drive if not is_scan(record)]
     seconds = 1e-9 * np.array([reading.stamp - readings[0].stamp for reading in readings[1:]])
@@ -76,10 +76,10 @@ def scaled(drive, *, way=1.0, turn=1.0, between=(0.0, np.inf)):
     for step in steps:
         driven.append(se2.compose(driven[-1], se2.exp(step)))
     poses = iter(driven)
-    return changed(drive, odometry=lambda reading: replace(reading, pose=next(poses)))
+    return change_records(drive, odometry=lambda reading: replace(reading, pose=next(poses)))
 
 
-def without(drive, dropped):
+def drop_records(drive, dropped):
     """Without the records of which a condition on seconds since the first and the record holds."""
     first = drive[0].measurement.stamp
     return Faulty(record for record in drive if not dropped(1e-9 * (record.measurement.stamp - first), record))
@@ -96,43 +96,43 @@ def test_nor_in_another_world_with_people_and_a_laser_ahead(seed):
 
 
 @pytest.mark.parametrize("seed", (0, 1))
-def test_where_the_laser_reaches_nothing_only_that_is_told(seed):
+def test_where_the_laser_reaches_nothing_only_that_is_reported(seed):
     log = open_log(f"sim:hall,seed={seed},beams=181", duration=60.0)
     assert subjects(log) == {"few returns": "wrong"}
 
 
 def test_a_laser_that_is_turned_is_found_with_the_angle(drive):
-    log = changed(drive, scan=lambda scan: turned(scan, math.radians(12.0)))
+    log = change_records(drive, scan=lambda scan: turn_laser(scan, math.radians(12.0)))
     assert subjects(log) == {"laser yaw": "wrong"}
     assert "turned by 12" in text_of(log, "laser yaw") or "turned by 11" in text_of(log, "laser yaw")
     assert "to the left" in text_of(log, "laser yaw")
 
 
 def test_a_laser_that_looks_backwards_is_found(drive):
-    assert subjects(changed(drive, scan=lambda scan: turned(scan, math.pi))) == {"laser backwards": "wrong"}
+    assert subjects(change_records(drive, scan=lambda scan: turn_laser(scan, math.pi))) == {"laser backwards": "wrong"}
 
 
 def test_a_laser_that_is_somewhere_else_is_found_with_the_place(drive):
-    log = changed(drive, scan=lambda scan: turned(scan, 0.0, -0.4))
+    log = change_records(drive, scan=lambda scan: turn_laser(scan, 0.0, -0.4))
     assert subjects(log) == {"laser place": "wrong"}
     forward = float(text_of(log, "laser place").split()[3])
     assert forward == pytest.approx(-0.4, abs=0.05)
 
 
 def test_a_mirrored_laser_is_found(drive):
-    log = changed(drive, scan=lambda scan: replace(scan, ranges=np.ascontiguousarray(scan.ranges[::-1])))
+    log = change_records(drive, scan=lambda scan: replace(scan, ranges=np.ascontiguousarray(scan.ranges[::-1])))
     assert subjects(log) == {"mirrored": "wrong"}
 
 
 @pytest.mark.parametrize(("scale", "severity"), ((1.15, "doubtful"), (0.8, "wrong")))
 def test_odometry_with_a_wrong_scale_of_ways_is_found(drive, scale, severity):
-    log = scaled(drive, way=scale)
+    log = scale_odometry(drive, way=scale)
     assert subjects(log) == {"translation scale": severity}
     assert float(text_of(log, "translation scale").split()[3]) == pytest.approx(scale, abs=0.03)
 
 
 def test_odometry_with_a_wrong_scale_of_turns_is_found(drive):
-    log = scaled(drive, turn=1.25)
+    log = scale_odometry(drive, turn=1.25)
     assert subjects(log) == {"rotation scale": "wrong"}
     assert float(text_of(log, "rotation scale").split()[3]) == pytest.approx(1.25, abs=0.03)
 
@@ -155,12 +155,12 @@ def test_clocks_that_are_apart_are_found_with_the_time(drive, offset):
 
 
 def test_odometry_that_drops_out_is_found(drive):
-    log = without(drive, lambda seconds, record: not is_scan(record) and 20.0 < seconds < 24.0)
+    log = drop_records(drive, lambda seconds, record: not is_scan(record) and 20.0 < seconds < 24.0)
     assert subjects(log) == {"odometry gaps": "doubtful", "scans without odometry": "wrong"}
 
 
 def test_odometry_that_stands_still_while_the_robot_drives_is_found(drive):
-    log = scaled(drive, way=0.0, turn=0.0, between=(20.0, 32.0))
+    log = scale_odometry(drive, way=0.0, turn=0.0, between=(20.0, 32.0))
     assert subjects(log) == {"odometry frozen": "wrong"}
 
 
@@ -171,7 +171,7 @@ def test_wheels_that_slip_are_found():
 
 def test_odometry_that_was_reset_is_found(drive):
     first = drive[0].measurement.stamp
-    log = changed(
+    log = change_records(
         drive,
         odometry=lambda reading: (
             replace(reading, pose=reading.pose + np.array([9.0, 0.0, 0.0]))
@@ -184,7 +184,7 @@ def test_odometry_that_was_reset_is_found(drive):
 
 def test_odometry_that_is_no_number_and_scans_without_beams_do_not_disturb(drive):
     second = drive[0].measurement.stamp + 10**9
-    log = changed(
+    log = change_records(
         drive,
         scan=lambda scan: replace(scan, ranges=scan.ranges[:0]) if scan.stamp < second else scan,
         odometry=lambda reading: replace(reading, pose=np.full(3, np.nan)) if reading.stamp == second else reading,
@@ -193,24 +193,24 @@ def test_odometry_that_is_no_number_and_scans_without_beams_do_not_disturb(drive
 
 
 def test_missing_scans_are_found(drive):
-    log = without(drive, lambda seconds, record: is_scan(record) and 20.0 < seconds < 23.0)
+    log = drop_records(drive, lambda seconds, record: is_scan(record) and 20.0 < seconds < 23.0)
     assert subjects(log) == {"scan gaps": "doubtful"}
 
 
 def test_scans_that_are_too_far_apart_are_found(drive):
-    log = without(drive, lambda seconds, record: is_scan(record) and seconds % 3.0 > 0.1)
+    log = drop_records(drive, lambda seconds, record: is_scan(record) and seconds % 3.0 > 0.1)
     assert subjects(log) == {"sparse scans": "doubtful"}
 
 
 def with_ranges(drive, change):
     random = np.random.default_rng(0)
 
-    def spoilt(scan):
+    def spoil_ranges(scan):
         ranges = scan.ranges.copy()
         change(ranges, random)
         return replace(scan, ranges=ranges)
 
-    return changed(drive, scan=spoilt)
+    return change_records(drive, scan=spoil_ranges)
 
 
 @pytest.mark.parametrize(
@@ -250,7 +250,7 @@ def test_beams_that_see_the_robot_are_found(drive):
     ),
 )
 def test_scans_that_cannot_be_are_found(drive, change, subject):
-    found = subjects(changed(drive[:200], scan=lambda scan: replace(scan, **change)))
+    found = subjects(change_records(drive[:200], scan=lambda scan: replace(scan, **change)))
     assert found[subject] == "wrong"
 
 
@@ -264,9 +264,9 @@ def test_stamps_that_jump_back_or_stay_are_found(drive):
     assert "once, by up to 0.100 s" in text_of(log, "scan stamps jump back")
 
 
-def test_a_robot_that_stands_is_not_judged(drive):
+def test_a_robot_that_stands_is_not_scored(drive):
     scan = next(record.measurement for record in drive if is_scan(record))
-    log = changed(
+    log = change_records(
         drive[:400],
         scan=lambda other: replace(scan, stamp=other.stamp),
         odometry=lambda reading: replace(reading, pose=np.zeros(3)),
@@ -326,13 +326,13 @@ def test_what_a_scan_says_of_itself_is_read_without_its_ranges(frame):
 
 
 def test_the_command_says_what_is_wrong_and_returns_it(drive, tmp_path, capsys):
-    log = changed(drive, scan=lambda scan: turned(scan, math.radians(12.0)))
+    log = change_records(drive, scan=lambda scan: turn_laser(scan, math.radians(12.0)))
     write_bag(log, tmp_path / "bag")
     assert main(["doctor", str(tmp_path / "bag")]) == 1
-    said = capsys.readouterr().out.splitlines()
-    assert said[0].startswith("wrong    laser yaw: The laser is turned by 1")
-    assert said[-1].startswith("1 wrong, 0 doubtful, ")
-    assert any("Odometry is odom -> base_link, scans are in laser." in line for line in said)
+    sent = capsys.readouterr().out.splitlines()
+    assert sent[0].startswith("wrong    laser yaw: The laser is turned by 1")
+    assert sent[-1].startswith("1 wrong, 0 doubtful, ")
+    assert any("Odometry is odom -> base_link, scans are in laser." in line for line in sent)
     assert main(["doctor", "--json", str(tmp_path / "bag")]) == 1
     found = json.loads(capsys.readouterr().out)["findings"]
     assert [one["subject"] for one in found if one["severity"] == "wrong"] == ["laser yaw"]

@@ -78,7 +78,7 @@ def test_a_pose_at_a_tenth_of_a_second_counts_and_one_later_is_missed():
     assert errors.translation.max == 0.0
 
 
-def test_with_odometry_a_pose_is_carried_to_the_time_asked_for():
+def test_with_odometry_a_pose_is_extrapolated_to_the_time_requested():
     """At 2 s the odometry has gone 1 m ahead since the pose at 1 s, which looks along +y in the trajectory."""
     trajectory = poses_at((0, 0, 0, 0), (1, 5, 0, np.pi / 2))
     odometry = poses_at((0, 7, 7, 0), (1, 8, 7, 0), (2, 9, 7, 0.25))
@@ -90,7 +90,7 @@ def test_with_odometry_a_pose_is_carried_to_the_time_asked_for():
     assert errors.rotation.max == pytest.approx(0.0, abs=1e-12)
 
 
-def test_odometry_with_a_gap_carries_nothing_across_it():
+def test_odometry_with_a_gap_bridges_nothing_across_it():
     trajectory, odometry = poses_at((0, 0, 0, 0)), poses_at((0, 0, 0, 0), (1, 1, 0, 0))
     errors = evaluate_relations(trajectory, relations_of((0, 2, 2, 0, 0), (0, 1, 1, 0, 0)), odometry).overall
     assert (errors.matched, errors.missed) == (1, 1)

@@ -20,7 +20,7 @@ def trajectory(stamps):
     return StampedPoses(stamps, np.column_stack((np.arange(stamps.size), stamps, np.zeros(stamps.size))))
 
 
-def test_stamps_survive_to_the_nanosecond_and_poses_to_the_nanometre(tmp_path):
+def test_stamps_survive_to_the_nanosecond_and_poses_to_the_nanometer(tmp_path):
     stamps = [976_052_857_337_284_001, 976_052_857_337_284_000, 1, 0, -1, 1_137_834_225_713_385_600]
     poses = np.array([[1.5, -2.25, theta] for theta in (0.0, np.pi / 2, -np.pi, 3.0, -1e-9, 0.25)])
     write_tum(tmp_path / "t.tum", StampedPoses(np.array(stamps), poses))

@@ -73,13 +73,13 @@ class _Explored:
         self.robot = DrivenRobot(scenario)
         configuration = with_changes(Configuration(), changes or {})
         self.run = DrivenRun(self.robot, configuration, Explorer(configuration))
-        self.outcome = self.run.do(Task("explore"), 400.0) if explore else None
+        self.outcome = self.run.run_task(Task("explore"), 400.0) if explore else None
         self.length = len(path_of(self))
 
 
 @cache
-def explored(number: int = 0) -> _Explored:
-    """One and the same exploration for all tests that ask for this number."""
+def explore(number: int = 0) -> _Explored:
+    """One and the same exploration for all tests that request this number."""
     del number
     return _Explored()
 
@@ -89,16 +89,16 @@ def path_of(own: _Explored) -> Float64:
     return own.robot.true_poses(np.arange(START, own.robot.stamp, NANOSECONDS // 5))
 
 
-def done(outcome: TaskResult | None) -> TaskResult:
+def completed_task(outcome: TaskResult | None) -> TaskResult:
     """An outcome that is there."""
     assert outcome is not None
     return outcome
 
 
 def test_explores_all_of_a_floor_hallways_first() -> None:
-    own = explored()
+    own = explore()
     path = path_of(own)[:, :2]
-    assert done(own.outcome).succeeded
+    assert completed_task(own.outcome).succeeded
     assert own.robot.contacts == 0
     entered = [int(np.argmax(np.hypot(*(path - room).T) < 1.9)) for room in ROOMS]
     arm, end = (int(np.argmax(np.hypot(*(path - place).T) < 3.5)) for place in ((6.0, 8.0), (11.0, 0.0)))
@@ -106,26 +106,26 @@ def test_explores_all_of_a_floor_hallways_first() -> None:
 
 
 def test_rooms_have_names_and_the_robot_goes_there() -> None:
-    own = explored()
+    own = explore()
     names = [name for name in own.run.driver.exploration_map.named_places() if name.startswith("room")]
     assert names == ["room 1", "room 2"]
     for name in names:
-        assert done(own.run.do(Task("go", name), 120.0)).succeeded
+        assert completed_task(own.run.run_task(Task("go", name), 120.0)).succeeded
         place = true_place(own.run, name)
         assert np.hypot(*(own.robot.pose - place)[:2]) < 0.3
         assert np.abs(ROOMS - place[:2]).max(axis=1).min() < 2.0
     assert own.robot.contacts == 0
 
 
-def test_backtracking_goes_along_its_own_path_until_told_to_stop() -> None:
-    own = explored(1)
+def test_backtracking_goes_along_its_own_path_until_stopped() -> None:
+    own = explore(1)
     at = len(path_of(own))
-    assert own.run.do(Task("backtrack"), 12.0) is None
+    assert own.run.run_task(Task("backtrack"), 12.0) is None
     back = path_of(own)[at:, :2]
     assert np.hypot(*(back[-1] - back[0])) > 1.0
     before = path_of(own)[:at, :2]
     assert max(np.hypot(*(before - place).T).min() for place in back) < 0.6
-    assert own.run.do(Task("stop"), 3.0) is None
+    assert own.run.run_task(Task("stop"), 3.0) is None
     assert own.robot.velocity == (0.0, 0.0)
 
 
@@ -136,16 +136,16 @@ def goes(own: _Explored, *probabilities: float) -> GoalPose | None:
     """
     explorer, atlas = own.run.driver, own.run.driver.exploration_map
     best, area, sequence = atlas.replica.best_hypothesis, atlas.pose.area, max(atlas.replica.scans)
-    leaves = tuple(Hypothesis(best + k, best, share, area) for k, share in enumerate(probabilities))
-    explorer.handle(Hypotheses(sequence, leaves, 0.0))
+    hypotheses = tuple(Hypothesis(best + k, best, share, area) for k, share in enumerate(probabilities))
+    explorer.handle(Hypotheses(sequence, hypotheses, 0.0))
     explorer.handle(ClosureDecision(sequence, None, (), ()))
-    said = explorer.handle(replace(scan_at((1.0, 0.0, 0.0)), stamp=atlas.pose.stamp))
-    return next((word for word in said if isinstance(word, GoalPose)), None)
+    messages = explorer.handle(replace(scan_at((1.0, 0.0, 0.0)), stamp=atlas.pose.stamp))
+    return next((word for word in messages if isinstance(word, GoalPose)), None)
 
 
 def test_it_turns_back_while_several_topological_paths_are_probable() -> None:
     own = _Explored(explore=False, changes={"explorer.backtracks": True})
-    assert own.run.do(Task("explore"), 25.0) is None
+    assert own.run.run_task(Task("explore"), 25.0) is None
     back = goes(own, 0.6, 0.4)
     assert back is not None
     # It began there, in the frame of the first area.
@@ -157,9 +157,9 @@ def test_it_turns_back_while_several_topological_paths_are_probable() -> None:
     assert np.hypot(*on.pose[:2]) > 1.0
 
 
-def test_it_explores_on_where_nobody_asks_it_to_turn_back() -> None:
+def test_it_explores_on_where_nobody_requests_it_to_turn_back() -> None:
     own = _Explored(explore=False)
-    assert own.run.do(Task("explore"), 25.0) is None
+    assert own.run.run_task(Task("explore"), 25.0) is None
     assert own.run.driver.exploration_map.entropy == 0.0
     on = goes(own, 0.6, 0.4)
     assert own.run.driver.exploration_map.entropy == pytest.approx(0.673, abs=0.001)
@@ -168,28 +168,30 @@ def test_it_explores_on_where_nobody_asks_it_to_turn_back() -> None:
 
 def test_scans_may_come_after_any_message_of_the_chain() -> None:
     own = _Explored(explore=False)
-    assert own.run.do(Task("explore"), 25.0) is None
+    assert own.run.run_task(Task("explore"), 25.0) is None
     explorer, atlas = own.run.driver, own.run.driver.exploration_map
     replica, pose = atlas.replica, atlas.pose
     new = max(replica.scans) + 1
     scan = replace(scan_at((1.0, 0.0, 0.0)), stamp=pose.stamp)
-    leaf = HypothesisEstimate(replica.best_hypothesis, pose.area, pose.pose_in_area, True, 0.0, 0.0, Clutter(), 12.0)
+    hypothesis = HypothesisEstimate(
+        replica.best_hypothesis, pose.area, pose.pose_in_area, True, 0.0, 0.0, Clutter(), 12.0
+    )
     explorer.handle(scan)
-    explorer.handle(Keyframe(new, scan, 0.0, (leaf,)))
+    explorer.handle(Keyframe(new, scan, 0.0, (hypothesis,)))
     explorer.handle(Task("explore"))
     assert explorer.handle(scan)
     assert new in atlas.roadmap.graph
     assert new in atlas.keyframe_locator
 
 
-def test_unknown_places_are_told() -> None:
-    outcome = done(explored().run.do(Task("go", "cellar"), 5.0))
+def test_unknown_places_are_reported() -> None:
+    outcome = completed_task(explore().run.run_task(Task("go", "cellar"), 5.0))
     assert not outcome.succeeded
     assert "choose from room 1, room 2, area 0" in outcome.text
 
 
 def test_a_known_map_is_known_from_the_start() -> None:
-    known = explored(1).run.driver.exploration_map
+    known = explore(1).run.driver.exploration_map
     atlas = Explorer(Configuration(), Replica.from_state(known.replica.state)).exploration_map
     assert set(atlas.named_places()) >= set(known.named_places())
     for name in ("room 1", "room 2"):
@@ -200,7 +202,7 @@ def test_a_known_map_is_known_from_the_start() -> None:
 
 def test_it_stands_where_nothing_tells_the_pose_any_more() -> None:
     own = _Explored(explore=False)
-    own.run.do(Task("explore"), 5.0)
+    own.run.run_task(Task("explore"), 5.0)
     scan = own.robot.measure()[1] or scan_at((1.0, 0.0, 0.0))
     moving, lost = (
         own.run.driver.handle(replace(scan, stamp=own.robot.stamp + after))[-1] for after in (0, 2 * NANOSECONDS)
@@ -211,8 +213,8 @@ def test_it_stands_where_nothing_tells_the_pose_any_more() -> None:
 
 
 def test_same_seed_same_path_bit_for_bit() -> None:
-    one, other = path_of(explored()), path_of(explored(1))
-    known = min(explored(number).length for number in (0, 1))
+    one, other = path_of(explore()), path_of(explore(1))
+    known = min(explore(number).length for number in (0, 1))
     assert known > 100
     assert np.array_equal(one[:known], other[:known])
 
@@ -274,8 +276,8 @@ def test_places_beside_each_other_are_joined_whatever_stands_about() -> None:
     assert set(survey.distances(0)) == {0, 4}
 
 
-def surveyed(poses: list[tuple[float, float, float]], walls: Float64, person: Float64, until: int = 0) -> Roadmap:
-    """A survey of a floor with keyframes at these poses, one after the other, somebody (1, 3) being there at first.
+def make_survey(poses: list[tuple[float, float, float]], walls: Float64, person: Float64, until: int = 0) -> Roadmap:
+    """A survey of a floor with keyframes at these poses, one after the other, with a person at (1, 3) at first.
 
     :param until: this keyframe.
     """
@@ -290,7 +292,7 @@ def surveyed(poses: list[tuple[float, float, float]], walls: Float64, person: Fl
 def test_the_end_of_a_hallway_is_no_room() -> None:
     hallway = [(x, 0.0, 0.0) for x in np.arange(1.0, 11.1, 0.5)]
     person = np.array([[4.2, 0.0, 0.5]])
-    survey = surveyed(hallway, small_floor().walls, person, until=4)
+    survey = make_survey(hallway, small_floor().walls, person, until=4)
     # From there it looked like one.
     laser = Laser(LASER)
     seen = laser.distances(np.array([hallway[0]]), wall_index(small_floor().walls), person)
@@ -303,14 +305,14 @@ def test_a_room_behind_a_gap_in_a_room_is_part_of_it() -> None:
     plan = FloorPlan()
     plan.cut_rectangle(0.0, -1.0, 12.0, 1.0)
     plan.cut_rectangle(4.5, -1.3, 5.5, -0.9)
-    # Two cupboards leave a gap of a metre in the middle of the room.
+    # Two cupboards leave a gap of a meter in the middle of the room.
     plan.cut_rectangle(3.0, -4.0, 7.0, -1.2)
     plan.cut_rectangle(4.5, -4.4, 5.5, -3.9)
     plan.cut_rectangle(3.0, -8.0, 7.0, -4.3)
     poses = [(x, 0.0, 0.0) for x in np.arange(1.0, 10.0, 0.5)]
     poses += [(5.0, y, -0.5 * np.pi) for y in np.arange(-0.4, -7.0, -0.5)]
     poses += [(x, y, 0.0) for x in (4.0, 6.0) for y in (-2.5, -6.0, -6.8)]
-    survey = surveyed(poses, plan.walls(), np.empty((0, 3)))
+    survey = make_survey(poses, plan.walls(), np.empty((0, 3)))
     doors = [survey.graph.edges[edge]["door"] for edge in ((24, 27), (18, 21))]
     assert doors == [True, True]
     assert len(survey.rooms()) == 1
@@ -320,11 +322,11 @@ def test_a_room_behind_a_gap_in_a_room_is_part_of_it() -> None:
 def test_it_does_not_aim_behind_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
     aims: list[Float64] = []
 
-    def towards(scan: Scan, goal: Float64, velocity: tuple[float, float], limits: MotionLimits) -> MotionCommand:
+    def drive_command(scan: Scan, goal: Float64, velocity: tuple[float, float], limits: MotionLimits) -> MotionCommand:
         aims.append(goal)
         return command_towards(scan, goal, velocity, limits)
 
-    monkeypatch.setattr("hmt_slam_ros.exploration.path_follower.command_towards", towards)
+    monkeypatch.setattr("hmt_slam_ros.exploration.path_follower.command_towards", drive_command)
     # From the northern arm around the eastern corner; the wall of the arm is at x = 7 up to y = 1.
     at = np.array([6.6, 1.6, 0.0])
     way = se2.transform(se2.inverse(at), np.array([(6.6, 1.6), (6.6, 0.5), (8.5, 0.5)]))
@@ -359,7 +361,7 @@ def test_no_progress_for_long_is_noticed(seconds: float, stuck: bool) -> None:
     assert pilot.is_stuck(1 + round(seconds * NANOSECONDS), 15 * NANOSECONDS) == stuck
 
 
-def test_errands_as_they_are_written() -> None:
+def test_tasks_as_they_are_written() -> None:
     assert parse_task("explore", EXPLORER_TASKS) == Task("explore")
     assert parse_task(" go room 3", EXPLORER_TASKS) == Task("go", "room 3")
     for text in ("go", "dance", "explore room 3", ""):

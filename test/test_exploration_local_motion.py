@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmark.driving import driven, scenario_of
+from benchmark.driving import drive_goals, scenario_of
 from hmt_slam_ros.exploration.local_motion import (
     _MAX_FREE_DISTANCE,
     MotionLimits,
@@ -123,15 +123,15 @@ def test_the_path_goes_through_the_middle_of_a_door_and_not_through_a_gap_that_i
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_it_reaches_goals_in_floors_with_people_without_contact(seed):
-    legs = list(driven(scenario_of("institute", seed, "360°"), 17))
+    legs = list(drive_goals(scenario_of("institute", seed, "360°"), 17))
     assert len(legs) == 17
     assert all(leg.reached for leg in legs)
     assert sum(leg.contacts for leg in legs) == 0
-    assert sum(leg.metres for leg in legs) > 50.0
+    assert sum(leg.distance for leg in legs) > 50.0
 
 
 @pytest.mark.parametrize("laser", ["360°", "180°"])
-def test_it_passes_doors_of_ninety_centimetres(laser):
-    legs = list(driven(scenario_of("doors", 4, laser), 8))
+def test_it_passes_doors_of_ninety_centimeters(laser):
+    legs = list(drive_goals(scenario_of("doors", 4, laser), 8))
     assert all(leg.reached for leg in legs)
     assert sum(leg.contacts for leg in legs) == 0

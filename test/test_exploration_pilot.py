@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_floor import AREAS, CONFIGURATION, mapped, seen_at
+from small_floor import AREAS, CONFIGURATION, make_map, seen_at
 
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
@@ -26,13 +26,13 @@ NEW_AREA = 7
 
 
 @pytest.fixture(scope="module")
-def saved():
-    hybrid_map, scans = mapped()
+def saved_map():
+    hybrid_map, scans = make_map()
     return Replica(scans, {0: hybrid_map}, {0: 1.0}, {0: 0}).state
 
 
 class Robot:
-    """It does what it is told, and RTL tells where it is: always, from the door on, never, or elsewhere.
+    """It follows commands, and RTL gives its pose: always, from the door on, never, or elsewhere.
 
     RTL that is lost has it in an area that the map has not.
 
@@ -42,20 +42,20 @@ class Robot:
     def __init__(self, missions, pose, rtl="always"):
         self.missions, self.pose, self.odometry, self.rtl = missions, np.array(pose), np.zeros(3), rtl
         self.rng, self.stamp = np.random.default_rng(0), BEGIN
-        self.velocity, self.said = np.zeros(3), []
+        self.velocity, self.sent = np.zeros(3), []
         self.slip = 1.0
 
-    def hear(self, message):
-        said = self.missions.handle(message)
-        self.said += said
-        for answer in said:
+    def handle_all(self, message):
+        messages = self.missions.handle(message)
+        self.sent += messages
+        for answer in messages:
             if isinstance(answer, VelocityCommand):
                 self.velocity = np.array([answer.speed, 0.0, answer.turn_rate])
             if isinstance(answer, PoseReset) and self.rtl == "door":
                 self.rtl = "always"
-        return said
+        return messages
 
-    def told(self):
+    def rtl_pose(self):
         """What RTL says."""
         area = int(self.pose[0] > 8.0)
         pose = se2.between(AREAS[area], self.pose)
@@ -74,34 +74,34 @@ class Robot:
 
     def step(self, velocity=None):
         """Odometry, pose and scan, and on; what the pilot says."""
-        said = self.hear(replace(seen_at(self.pose, self.rng), stamp=self.stamp))
-        said += self.hear(Odometry(self.stamp, self.odometry))
+        messages = self.handle_all(replace(seen_at(self.pose, self.rng), stamp=self.stamp))
+        messages += self.handle_all(Odometry(self.stamp, self.odometry))
         if self.rtl != "never":
-            said += self.hear(self.told())
+            messages += self.handle_all(self.rtl_pose())
         increment = se2.exp(PERIOD * (self.velocity if velocity is None else np.array(velocity)))
         rolled = increment * (self.slip if self.pose[1] > 1.0 else 1.0)
         self.pose, self.odometry = se2.compose(self.pose, increment), se2.compose(self.odometry, rolled)
         self.stamp += round(1e9 * PERIOD)
-        return said
+        return messages
 
     def do(self, text, steps=600):
-        """How an errand ends."""
-        said = self.hear(parse_task(text, PILOT_TASKS))
+        """How a task ends."""
+        messages = self.handle_all(parse_task(text, PILOT_TASKS))
         for _ in range(steps):
-            for answer in said:
+            for answer in messages:
                 if isinstance(answer, TaskResult):
                     return answer
-            said = self.step()
+            messages = self.step()
         return None
 
     def starts(self):
-        return [message.initial_pose for message in self.said if isinstance(message, PoseReset)]
+        return [message.initial_pose for message in self.sent if isinstance(message, PoseReset)]
 
     def estimate(self):
-        return next(message for message in reversed(self.said) if isinstance(message, PlaceEstimate))
+        return next(message for message in reversed(self.sent) if isinstance(message, PlaceEstimate))
 
 
-def off(place, pose):
+def pose_error(place, pose):
     return se2.between(place.pose.mean, se2.between(AREAS[place.area], pose))
 
 
@@ -110,54 +110,54 @@ def the_room(missions):
     return room
 
 
-def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_until_it_does(saved):
-    missions = PilotProcess(CONFIGURATION, saved)
+def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_until_it_does(saved_map):
+    missions = PilotProcess(CONFIGURATION, saved_map)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="door"), the_room(missions)
     outcome = robot.do("go cellar")
     assert (outcome.succeeded, outcome.text) == (False, f"go cellar: there is no such room: choose from {room}")
     stood = []
-    robot.hear(parse_task(f"go {room}", PILOT_TASKS))
+    robot.handle_all(parse_task(f"go {room}", PILOT_TASKS))
     while not robot.starts():
         stood.append(robot.pose)
         robot.step()
     (place,) = robot.starts()
-    assert np.abs(off(place, stood[-1])).max() < 0.05
+    assert np.abs(pose_error(place, stood[-1])).max() < 0.05
     np.testing.assert_allclose(stood[-1], stood[-2], atol=0.02)
     outcome = robot.do(f"go {room}")
     assert (outcome.succeeded, outcome.text) == (True, f"go {room}: the robot is there")
     assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
     assert len(robot.starts()) == 1
-    said = robot.estimate()
-    assert (said.place, said.room, said.confident) == (room.replace("room", "door"), room, True)
+    messages = robot.estimate()
+    assert (messages.place, messages.room, messages.confident) == (room.replace("room", "door"), room, True)
     np.testing.assert_array_equal(robot.velocity, 0.0)
     assert robot.do("localize").text == f"localize: the robot is in {room}"
     assert robot.do(f"go {room}").succeeded
 
 
-def test_metric_slam_that_has_the_robot_at_the_door_is_told_nothing(saved):
-    missions = PilotProcess(CONFIGURATION, saved)
+def test_metric_slam_that_has_the_robot_at_the_door_gets_no_initial_pose(saved_map):
+    missions = PilotProcess(CONFIGURATION, saved_map)
     robot = Robot(missions, (12.0, 0.0, math.pi))
     assert robot.do(f"go {the_room(missions)}").succeeded
     assert not robot.starts()
 
 
 @pytest.mark.parametrize("rtl", ["never", "lost"])
-def test_a_robot_that_metric_slam_does_not_find_behind_the_door_goes_by_the_map_of_the_room(saved, rtl):
-    missions = PilotProcess(CONFIGURATION, saved)
+def test_a_robot_that_metric_slam_does_not_find_behind_the_door_goes_by_the_map_of_the_room(saved_map, rtl):
+    missions = PilotProcess(CONFIGURATION, saved_map)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl), the_room(missions)
     robot.slip = 1.2
     assert robot.do(f"go {room}").succeeded
     assert len(robot.starts()) == 1
-    (heading,) = {message for message in robot.said if isinstance(message, GoalPose)}
+    (heading,) = {message for message in robot.sent if isinstance(message, GoalPose)}
     place = se2.compose(AREAS[heading.area], heading.pose)
     np.testing.assert_allclose(place, (5.0, 3.0, 0.5 * math.pi), atol=0.1)
     assert math.dist(robot.pose[:2], place[:2]) < 0.2
 
 
-def test_where_metric_slam_has_the_robot_elsewhere_the_belief_begins_anew_and_no_door_is_entered(saved):
-    missions = PilotProcess(CONFIGURATION, saved)
+def test_where_metric_slam_has_the_robot_elsewhere_the_belief_restarts_and_no_door_is_entered(saved_map):
+    missions = PilotProcess(CONFIGURATION, saved_map)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="elsewhere"), the_room(missions)
-    robot.hear(parse_task(f"go {room}", PILOT_TASKS))
+    robot.handle_all(parse_task(f"go {room}", PILOT_TASKS))
     confident = []
     for _ in range(250):
         robot.step()
@@ -171,12 +171,12 @@ def test_where_metric_slam_has_the_robot_elsewhere_the_belief_begins_anew_and_no
     assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
 
 
-def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_once(saved):
+def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_once(saved_map):
     configuration = with_changes(CONFIGURATION, {"pilot.drives": False})
-    missions = PilotProcess(configuration, saved)
+    missions = PilotProcess(configuration, saved_map)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="never"), the_room(missions)
     assert "pilot.drives is false" in robot.do(f"go {room}").text
-    robot.said.clear()
+    robot.sent.clear()
     robot.step()
     assert robot.estimate().place is None
     while robot.pose[0] > 5.0:
@@ -189,32 +189,32 @@ def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_onc
         at.append(robot.pose)
         if any(isinstance(message, PoseReset) for message in robot.step((0.5, 0.0, 0.0))):
             (place,) = robot.starts()
-            assert np.abs(off(place, at[-1])).max() < 0.1
+            assert np.abs(pose_error(place, at[-1])).max() < 0.1
     assert len(robot.starts()) == 1
-    assert not any(isinstance(message, VelocityCommand) for message in robot.said)
+    assert not any(isinstance(message, VelocityCommand) for message in robot.sent)
 
 
-def test_it_finds_out_where_it_is_and_stops_when_told_or_when_it_takes_too_long(saved):
-    missions = PilotProcess(with_changes(CONFIGURATION, {"pilot.task_timeout": 2.0}), saved)
+def test_it_finds_out_where_it_is_and_stops_on_request_or_when_it_takes_too_long(saved_map):
+    missions = PilotProcess(with_changes(CONFIGURATION, {"pilot.task_timeout": 2.0}), saved_map)
     robot = Robot(missions, (14.0, 0.0, math.pi), rtl="never")
     assert robot.do("localize").text == "localize: given up after 2 s"
     np.testing.assert_array_equal(robot.velocity, 0.0)
-    robot.hear(parse_task("localize", PILOT_TASKS))
+    robot.handle_all(parse_task("localize", PILOT_TASKS))
     robot.step()
-    robot.hear(parse_task("stop", PILOT_TASKS))
+    robot.handle_all(parse_task("stop", PILOT_TASKS))
     np.testing.assert_array_equal(robot.velocity, 0.0)
     assert not any(isinstance(message, VelocityCommand) for message in robot.step())
-    robot = Robot(PilotProcess(CONFIGURATION, saved), (14.0, 0.0, math.pi), rtl="never")
+    robot = Robot(PilotProcess(CONFIGURATION, saved_map), (14.0, 0.0, math.pi), rtl="never")
     outcome = robot.do("localize")
     assert outcome.succeeded
     assert outcome.text.startswith("localize: the robot is at door ")
 
 
-def test_where_time_goes_back_the_robot_may_be_anywhere(saved):
-    missions = PilotProcess(CONFIGURATION, saved)
+def test_where_time_goes_back_the_robot_may_be_anywhere(saved_map):
+    missions = PilotProcess(CONFIGURATION, saved_map)
     robot = Robot(missions, (12.0, 0.0, math.pi), rtl="never")
     assert robot.do("localize").succeeded
-    robot.hear(parse_task("localize", PILOT_TASKS))
+    robot.handle_all(parse_task("localize", PILOT_TASKS))
     robot.stamp -= 3_000_000_000
     assert [answer.text for answer in robot.step() if isinstance(answer, TaskResult)] == [
         "localize: given up: time went back"
@@ -223,8 +223,8 @@ def test_where_time_goes_back_the_robot_may_be_anywhere(saved):
     assert robot.estimate().place is None
 
 
-def test_one_who_drives_the_robot_out_of_a_room_brings_it_before_the_door(saved):
-    missions = PilotProcess(CONFIGURATION, saved)
+def test_one_who_drives_the_robot_out_of_a_room_brings_it_before_the_door(saved_map):
+    missions = PilotProcess(CONFIGURATION, saved_map)
     robot, room = Robot(missions, (12.0, 0.0, math.pi)), the_room(missions)
     assert robot.do(f"go {room}").succeeded
     for _ in range(20):
@@ -234,8 +234,8 @@ def test_one_who_drives_the_robot_out_of_a_room_brings_it_before_the_door(saved)
         robot.step((0.5, 0.0, turn))
     for _ in range(2):
         robot.step((0.0, 0.0, 0.0))
-    said = robot.estimate()
-    assert (said.place, said.room, said.confident) == (room.replace("room", "door"), None, True)
+    messages = robot.estimate()
+    assert (messages.place, messages.room, messages.confident) == (room.replace("room", "door"), None, True)
 
 
 def test_a_map_without_places_is_refused():

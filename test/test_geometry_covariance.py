@@ -29,7 +29,7 @@ def test_a_turn_is_the_adjoint_of_a_rotation(random):
     np.testing.assert_allclose(rotate_covariance(matrix, theta), ad @ matrix @ ad.T, atol=1e-12)
 
 
-def test_carried_to_the_end_of_a_motion(random):
+def test_propagated_to_the_end_of_a_motion(random):
     matrix, motion = covariance(random), random.uniform(-3.0, 3.0, 3)
     ad = se2.adjoint(se2.inverse(motion))
     np.testing.assert_allclose(propagate_covariance(matrix, motion), ad @ matrix @ ad.T, atol=1e-12)

@@ -51,8 +51,8 @@ def test_the_doubles_next_to_half_a_turn_wrap_inside_the_interval():
     for turns in range(-6, 7, 2):
         for edge in (-math.pi, math.pi):
             angle = edge + turns * math.pi
-            for neighbour in (np.nextafter(angle, -np.inf), angle, np.nextafter(angle, np.inf)):
-                assert -math.pi <= float(se2.wrap(neighbour)) < math.pi
+            for neighbor in (np.nextafter(angle, -np.inf), angle, np.nextafter(angle, np.inf)):
+                assert -math.pi <= float(se2.wrap(neighbor)) < math.pi
 
 
 @given(angles)
@@ -60,7 +60,7 @@ def test_an_angle_inside_the_interval_keeps_its_bits(angle):
     assert float(se2.wrap(angle)) == angle
 
 
-def test_a_motion_is_carried_out_in_the_frame_that_the_first_one_leads_to():
+def test_a_motion_is_done_in_the_frame_that_the_first_one_leads_to():
     np.testing.assert_allclose(se2.compose([1.0, 2.0, QUARTER], [3.0, 4.0, QUARTER]), [-3.0, 5.0, -math.pi], atol=1e-12)
 
 
@@ -142,7 +142,7 @@ def test_exp_is_accurate_where_its_series_takes_over(omega):
 
 
 @given(poses, st.tuples(lengths, lengths, st.floats(-0.5, 0.5)))
-def test_the_adjoint_carries_a_twist_to_the_other_side(pose, xi):
+def test_the_adjoint_moves_a_twist_to_the_other_side(pose, xi):
     left = se2.compose(pose, se2.exp(xi))
     right = se2.compose(se2.exp(se2.adjoint(pose) @ np.array(xi)), pose)
     assert_same_pose(left, right, atol=1e-7)

@@ -1,4 +1,4 @@
-"""The map that hypotheses share: what is asked of it, and its arcs as arrays."""
+"""The map that hypotheses share: what it returns, and its arcs as arrays."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def star():
     return common
 
 
-def test_the_neighbours_of_an_area_are_those_that_arcs_join_to_it(star):
+def test_the_neighbors_of_an_area_are_those_that_arcs_join_to_it(star):
     assert sorted(star.neighbors(40)) == list(range(40))
     assert sorted(star.neighbors(3)) == [4, 40]
     assert star.neighbors(0) == [40]
@@ -133,7 +133,7 @@ def test_an_area_that_becomes_part_of_another_is_seen_from_there():
     assert merged.max_area_id == 3
 
 
-def test_two_arcs_to_the_same_third_area_become_one_that_both_have_told():
+def test_two_arcs_to_the_same_third_area_become_one_that_both_observed():
     before, merged = joined_twice(), joined_twice()
     merged.merge(2, 0, merged.arc(0, 2))
     found = [before.arc(0, 1), before.arc(0, 2).compose(before.arc(2, 1))]

@@ -27,7 +27,7 @@ def chain_of(graph, n):
     return poses
 
 
-def simulated(n, loops, seed, spread=SPREAD):
+def simulate_graph(n, loops, seed, spread=SPREAD):
     """True poses on a wavy circle, and a chain with extra edges, each with noise of its own."""
     rng = np.random.default_rng(seed)
     angle = np.linspace(0.0, 2.0 * np.pi, n, endpoint=False)
@@ -50,21 +50,18 @@ def dense_solution(initial, graph):
         relative = se2.between(at[graph.sources], at[graph.targets])
         return np.einsum("mij,mj->mi", root, se2.log(se2.between(graph.poses, relative))).ravel()
 
-    def moved(at, change):
+    def move(at, change):
         return se2.compose(at, se2.exp(np.concatenate((np.zeros(3), change)).reshape(-1, 3)))
 
     size = 3 * (len(poses) - 1)
     for _ in range(30):
         h = 1e-6
         jacobian = np.stack(
-            [
-                (residuals(moved(poses, h * unit)) - residuals(moved(poses, -h * unit))) / (2 * h)
-                for unit in np.eye(size)
-            ],
+            [(residuals(move(poses, h * unit)) - residuals(move(poses, -h * unit))) / (2 * h) for unit in np.eye(size)],
             axis=1,
         )
         step = -np.linalg.lstsq(jacobian, residuals(poses), rcond=None)[0]
-        poses = moved(poses, step)
+        poses = move(poses, step)
         if np.abs(step).max() < 1e-11:
             break
     return poses, np.linalg.inv(jacobian.T @ jacobian), residuals(poses) @ residuals(poses)
@@ -135,7 +132,7 @@ def test_a_square_that_turns_too_little_closes():
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_poses_marginals_and_chi2_are_those_of_a_dense_solution(seed):
-    _, graph = simulated(14, 12, seed)
+    _, graph = simulate_graph(14, 12, seed)
     initial = chain_of(graph, 14)
     found = optimize(initial, graph)
     poses, covariance, cost = dense_solution(initial, graph)
@@ -146,7 +143,7 @@ def test_poses_marginals_and_chi2_are_those_of_a_dense_solution(seed):
 
 
 def test_the_fixed_node_may_be_any_and_keeps_its_pose():
-    _, graph = simulated(8, 6, 3)
+    _, graph = simulate_graph(8, 6, 3)
     initial = chain_of(graph, 8)
     one, other = optimize(initial, graph), optimize(initial, graph, fixed=5)
     np.testing.assert_array_equal(other.poses[5], initial[5])
@@ -156,7 +153,7 @@ def test_the_fixed_node_may_be_any_and_keeps_its_pose():
 
 
 def test_the_frame_of_the_start_does_not_matter():
-    _, graph = simulated(10, 8, 4)
+    _, graph = simulate_graph(10, 8, 4)
     initial = chain_of(graph, 10)
     there = np.array([100.0, -50.0, 2.0])
     one, other = optimize(initial, graph), optimize(se2.compose(there, initial), graph)
@@ -165,7 +162,7 @@ def test_the_frame_of_the_start_does_not_matter():
 
 
 def test_a_bad_start_is_damped_to_the_same_solution():
-    truth, graph = simulated(20, 15, 5)
+    truth, graph = simulate_graph(20, 15, 5)
     good = optimize(chain_of(graph, 20), graph)
     rng = np.random.default_rng(6)
     bad = se2.compose(truth, rng.normal(size=(20, 3)) * [1.5, 1.5, 0.5])
@@ -177,7 +174,7 @@ def test_errors_of_simulated_graphs_are_as_large_as_the_marginals_say():
     # NEES of one node over independent graphs: chi-square with 3 degrees of freedom each.
     nees = []
     for seed in range(60):
-        truth, graph = simulated(8, 5, 100 + seed)
+        truth, graph = simulate_graph(8, 5, 100 + seed)
         found = optimize(chain_of(graph, 8), graph)
         error = se2.log(se2.between(found.poses[5], truth[5]))
         nees.append(error @ np.linalg.solve(found.covariances[5], error))
@@ -186,7 +183,7 @@ def test_errors_of_simulated_graphs_are_as_large_as_the_marginals_say():
 
 def test_chi2_of_simulated_graphs_has_the_degrees_of_freedom_of_their_loops():
     values = [
-        optimize(chain_of(g, 8), g, marginals=False).chi2 for _, g in (simulated(8, 5, 200 + s) for s in range(60))
+        optimize(chain_of(g, 8), g, marginals=False).chi2 for _, g in (simulate_graph(8, 5, 200 + s) for s in range(60))
     ]
     assert chi2.ppf(0.005, 15 * 60) < np.sum(values) < chi2.ppf(0.995, 15 * 60)
 
@@ -257,7 +254,7 @@ def test_one_area_without_arcs_lies_at_the_origin():
 
 
 def test_covariances_of_nodes_relative_to_each_other_are_those_of_the_whole_system():
-    graph = simulated(12, 6, seed=3)[1]
+    graph = simulate_graph(12, 6, seed=3)[1]
     poses = optimize(chain_of(graph, 12), graph).poses
     whole = dense_solution(poses, graph)[1]
     between = np.array([[2, 7], [7, 2], [0, 5], [9, 9]])

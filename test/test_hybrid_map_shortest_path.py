@@ -74,7 +74,7 @@ def test_areas_beyond_the_cost_limit_are_left_out():
     assert list(shortest_path_beliefs(hybrid_map, 0, cost_limit=3 * 2 * 0.1**2 + 1e-6)) == [0, 1, 2, 3]
 
 
-def test_no_more_areas_than_asked_for_are_returned():
+def test_no_more_areas_than_requested_are_returned():
     found = shortest_path_beliefs(chain(*[arc(1.0, 0.0, 0.0, sigma) for sigma in (0.1, 0.2, 0.3, 0.4)]), 2, max_areas=3)
     assert list(found) == [2, 1, 0]
 
@@ -124,7 +124,7 @@ def test_own_arcs_replace_common_ones_and_beliefs_are_those_of_composition():
     found = shortest_path_beliefs(hybrid_map, 20)
     assert len(found) == 40
     for area, belief in list(found.items())[1:]:
-        # Every belief is that of a neighbour that was found before, carried on by the arc that counts.
+        # Every belief is that of a neighbor that was found before, extended by the arc that counts.
         before = [b for b in hybrid_map.neighbors(area) if list(found).index(b) < list(found).index(area)]
         ways = [found[b].compose(hybrid_map.arc(b, area)) for b in before]
         assert any(

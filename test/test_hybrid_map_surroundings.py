@@ -25,7 +25,7 @@ def belief(x, sigma):
     return PoseGaussian(np.array([x, 0.0, 0.0]), np.diag([sigma, sigma, 0.01]) ** 2)
 
 
-def placed(*poses):
+def area_poses(*poses):
     return {area: PoseGaussian(pose, np.eye(3)) for area, pose in enumerate(poses)}
 
 
@@ -58,20 +58,20 @@ def test_excluded_areas_are_left_out():
     assert list(areas_around(chain(0.05), 0, NEAR, excluded={1})) == [0]
 
 
-@pytest.mark.parametrize(("asked", "keyframe"), [((0.0, 0.0), (0.0, 0.0)), ((2.0, 0.5), (1.5, 0.0))])
-def test_the_quick_bound_lets_all_pass_that_are_near_and_few_others(asked, keyframe):
+@pytest.mark.parametrize(("requested", "keyframe"), [((0.0, 0.0), (0.0, 0.0)), ((2.0, 0.5), (1.5, 0.0))])
+def test_the_quick_bound_lets_all_pass_that_are_near_and_few_others(requested, keyframe):
     rng = np.random.default_rng(2)
     square = rng.normal(size=(200, 3, 3)) * np.array([0.3, 0.3, 0.05])[:, None]
     found = ShortestPaths(np.arange(200), rng.uniform(-9.0, 9.0, size=(200, 3)), square @ square.transpose(0, 2, 1))
     query = PoseGaussian(np.array([1.0, 2.0, 0.3]), np.diag([0.1, 0.2, 0.05]) ** 2)
-    lever, extent = np.hypot(*asked), np.hypot(*keyframe)
+    lever, extent = np.hypot(*requested), np.hypot(*keyframe)
     bounds = quick_entry_bounds(found, query, lever, np.full(200, extent + lever + 2.0), 2.0, 2.0)
     passed = bounds > 0.0
     near = []
     for mean, covariance in zip(found.means, found.covariances, strict=True):
         prior = PoseGaussian(mean, covariance).inverse().compose(query)
         spread = np.sqrt(np.linalg.eigvalsh(prior.covariance[:2, :2])[-1]) + lever * np.sqrt(prior.covariance[2, 2])
-        near.append(np.hypot(*(se2.transform(prior.mean, np.array(asked)) - keyframe)) <= 2.0 + 4.0 * spread)
+        near.append(np.hypot(*(se2.transform(prior.mean, np.array(requested)) - keyframe)) <= 2.0 + 4.0 * spread)
     assert passed[near].all()
     assert 20 < sum(near) < 180
     # Where the query and the area are points, the bound is the distance itself.
@@ -91,12 +91,12 @@ def test_the_quick_bound_is_one_on_the_probability_of_an_area_far_from_certain(a
 
 
 def test_a_global_pose_that_agrees_with_the_arcs_is_taken():
-    poses = placed(np.array([1.0, 1.0, 0.5]), se2.compose([1.0, 1.0, 0.5], [4.05, 0.0, 0.0]))
+    poses = area_poses(np.array([1.0, 1.0, 0.5]), se2.compose([1.0, 1.0, 0.5], [4.05, 0.0, 0.0]))
     assert np.allclose(consistent_pose(belief(4.0, 0.1), 0, 1, poses, 16.0), [4.05, 0.0, 0.0])
 
 
 def test_a_global_pose_that_contradicts_the_arcs_is_not():
-    poses = placed(np.zeros(3), np.array([6.0, 0.0, 0.0]))
+    poses = area_poses(np.zeros(3), np.array([6.0, 0.0, 0.0]))
     assert np.allclose(consistent_pose(belief(4.0, 0.1), 0, 1, poses, 16.0), [4.0, 0.0, 0.0])
     assert np.allclose(consistent_pose(belief(4.0, 0.1), 0, 7, poses, 16.0), [4.0, 0.0, 0.0])
 

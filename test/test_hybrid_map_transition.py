@@ -22,7 +22,7 @@ CORRIDORS = np.concatenate((box(-1.0, -1.0, 21.0, 1.0), box(-1.0, 1.0, 21.0, 3.0
 
 
 def place(first=0.0, last=8.0, border=5.0):
-    """Keyframes every metre along the lower corridor; those beyond ``border`` belong to area 7, the others to 3."""
+    """Keyframes every meter along the lower corridor; those beyond ``border`` belong to area 7, the others to 3."""
     x = np.arange(first, last + 0.1)
     poses = np.stack((x, np.zeros_like(x), np.zeros_like(x)), axis=1)
     scans = [scan_in(CORRIDORS, pose, field_of_view=2 * np.pi, beams=361) for pose in poses]
@@ -30,7 +30,7 @@ def place(first=0.0, last=8.0, border=5.0):
 
 
 def keyframes(x, y=0.0, count=4):
-    """Keyframes half a metre apart that begin at (x, y)."""
+    """Keyframes half a meter apart that begin at (x, y)."""
     return np.array([[x + 0.5 * k, y, 0.0] for k in range(count)])
 
 
@@ -93,7 +93,7 @@ def test_the_probability_is_that_of_the_gaussian():
     assert share == pytest.approx(0.5 * (1.0 + math.erf((10.0 - 9.0) / 0.8 / math.sqrt(2.0))), abs=0.02)
 
 
-def test_neighbouring_areas_share_the_probability(corridor):
+def test_neighboring_areas_share_the_probability(corridor):
     other = AreaPlace(7, corridor.keyframe_areas, corridor.positions, corridor.grid)
     prior = PoseGaussian(np.array([4.0, 0.0, 0.0]), np.diag([0.5, 0.1, 0.003]) ** 2)
     shares = [entry_prior(p, prior, keyframes(0.5), RADIUS).probability for p in (corridor, other)]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worlds import box, drive, scan_at, scan_in
 
-from benchmark.hallways import depth_in_rooms
+from benchmark.heading import depth_in_rooms
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.landmarks.area_classes import (
@@ -49,7 +49,7 @@ def test_what_is_seen_through_a_door_makes_no_room_longer():
     assert hallway_log_odds(opened, FEATURES) < -3.0
 
 
-def test_half_a_circle_tells_nothing():
+def test_half_a_circle_has_no_information():
     assert measure_free_space(rays_from_scan(scan_in(ROOM, (0.0, 0.0, 0.0), beams=181), FEATURES)) is None
 
 
@@ -86,7 +86,7 @@ def test_what_an_area_is_taken_for_changes_only_where_that_is_clear():
 
 
 @pytest.mark.parametrize(("walls", "hallway"), [(HALLWAY, True), (ROOM, False)])
-def test_a_stored_area_is_told_from_scans_of_half_a_circle(walls, hallway):
+def test_a_stored_area_is_distinguished_from_scans_of_half_a_circle(walls, hallway):
     poses = drive((-1.5, 0.2), (1.5, 0.2), (-1.5, 0.2))
     scans = [scan_in(walls, pose, beams=361, noise=0.015, seed=k) for k, pose in enumerate(poses)]
     kinds = AreaClassifier(LocalMapping(Configuration()))

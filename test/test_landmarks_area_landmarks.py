@@ -55,7 +55,7 @@ def test_what_is_gone_at_a_later_visit_is_not_believed_in_because_the_map_held_i
 
 
 @pytest.mark.parametrize("away", [10, 100])
-def test_only_a_robot_that_was_away_is_told_that_it_comes_back(away):
+def test_only_a_robot_that_was_away_returns(away):
     scans = [replace(whole(POSES[0], k), stamp=away * k * 1_000_000_000) for k in range(3)]
     sightings = AreaLandmarkExtractor(LocalMapping(Configuration())).observations(scans, POSES[[0, 0, 0]])
     assert [sighting.begins_visit for sighting in sightings] == [False, away > 60, away > 60]

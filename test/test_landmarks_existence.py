@@ -8,13 +8,13 @@ from hmt_slam_ros.hybrid_map.landmark import Existence
 FEATURES = FeatureParameters(landmark_detected=0.9, landmark_by_chance=0.1, landmark_lasting=0.99)
 
 
-def visited(existence, times, confidence=0.9):
+def visit(existence, times, confidence=0.9):
     for _ in range(times):
         existence = existence.update_on_detection(confidence, FEATURES)
     return existence
 
 
-def missed(existence, times):
+def miss(existence, times):
     for _ in range(times):
         existence = existence.update_on_miss(FEATURES)
     return existence
@@ -34,32 +34,32 @@ def test_that_it_is_a_landmark_is_the_mean_of_what_the_scans_say_that_show_it():
         Existence(0.1).update_on_detection(0.4, FEATURES).update_on_miss(FEATURES).update_on_detection(0.1, FEATURES)
     )
     assert existence.confidence == pytest.approx(0.2)
-    assert visited(Existence(0.1), 100, confidence=0.1).probability < 0.1
+    assert visit(Existence(0.1), 100, confidence=0.1).probability < 0.1
 
 
 def test_what_was_seen_a_hundred_times_is_gone_after_a_few_misses():
-    existence = visited(Existence(0.9), 100)
+    existence = visit(Existence(0.9), 100)
     assert existence.probability > 0.89
-    assert missed(existence, 4).probability < 0.05
+    assert miss(existence, 4).probability < 0.05
 
 
 def test_what_is_missed_once_in_ten_visits_stays():
     existence = Existence(0.9)
     for _ in range(20):
-        existence = missed(visited(existence, 9), 1)
+        existence = miss(visit(existence, 9), 1)
         assert existence.probability > 0.75
-    assert visited(existence, 2).probability > 0.89
+    assert visit(existence, 2).probability > 0.89
 
 
 def test_visits_are_counted():
-    existence = missed(visited(Existence(0.9), 3), 2)
+    existence = miss(visit(Existence(0.9), 3), 2)
     assert (existence.detections, existence.misses) == (4, 2)
 
 
 def test_one_look_suffices_for_what_is_gone_when_the_robot_comes_back():
-    existence = visited(Existence(1.0), 100, confidence=1.0)
-    assert missed(existence, 1).probability > 0.5
+    existence = visit(Existence(1.0), 100, confidence=1.0)
+    assert miss(existence, 1).probability > 0.5
     back = existence.mark_absence().mark_absence()
     assert back.probability == existence.probability
-    assert missed(back, 1).probability < 0.5
-    assert visited(back, 1, confidence=1.0).probability > 0.95
+    assert miss(back, 1).probability < 0.5
+    assert visit(back, 1, confidence=1.0).probability > 0.95

@@ -24,7 +24,7 @@ def lines_at(heading, walls=ROOM, seed=0):
     return extract_lines(scan_in(walls, pose, beams=361, field_of_view=2.0 * math.pi, noise=0.01, seed=seed), FEATURES)
 
 
-def turned(angle, deviation):
+def turn_motion(angle, deviation):
     return RelativeMotion(np.array([0.3, 0.0, angle]), np.diag([0.01, 0.01, deviation]) ** 2)
 
 
@@ -42,7 +42,7 @@ def test_while_nothing_is_seen_it_is_unknown():
     robot = BuildingHeading(FEATURES)
     nothing = extract_lines(blank_scan(), FEATURES)
     assert robot.observe(nothing) == 0
-    robot.predict(turned(0.3, 0.1))
+    robot.predict(turn_motion(0.3, 0.1))
     assert robot.observe(nothing) == 0
     assert not robot.is_known
     assert robot.observe(lines_at(0.2)) == 4
@@ -54,7 +54,7 @@ def test_it_does_not_drift_however_wrong_odometry_turns():
     for k in range(150):
         robot.observe(lines_at(truth, seed=k))
         assert abs(robot.angle - truth) < 0.01
-        robot.predict(turned(0.16, 0.05))
+        robot.predict(turn_motion(0.16, 0.05))
         truth, odometry = truth + 0.15, odometry + 0.16
     assert odometry - truth > 1.4  # three turns and a half, and nearly a quarter too many by odometry
 
@@ -65,33 +65,33 @@ def test_what_stands_aslant_is_left_out():
     assert len(lines_at(0.3, walls)) >= 6
     assert robot.observe(lines_at(0.3, walls)) == len(lines_at(0.3, walls)) - 2
     assert robot.angle == pytest.approx(0.3, abs=0.005)
-    robot.predict(turned(0.1, 0.03))
+    robot.predict(turn_motion(0.1, 0.03))
     robot.observe(lines_at(0.4, walls, seed=1))
     assert robot.angle == pytest.approx(0.4, abs=0.005)
 
 
 def test_walls_that_are_not_square_bound_what_is_known():
-    def after(square_deviation, looks):
+    def variance_after(square_deviation, looks):
         robot = BuildingHeading(FeatureParameters(range_deviation=0.01, square_deviation=square_deviation))
         for k in range(looks):
             robot.observe(lines_at(0.2, seed=k))
         return robot.variance
 
-    assert after(0.0, 50) < 0.1 * after(0.0, 1)
+    assert variance_after(0.0, 50) < 0.1 * variance_after(0.0, 1)
     one = math.radians(1.0) ** 2 / 4.0  # of four walls
-    assert one * 0.9 < after(1.0, 500) < one * 1.2
+    assert one * 0.9 < variance_after(1.0, 500) < one * 1.2
 
 
 def test_where_nothing_is_seen_the_variance_grows():
     robot = BuildingHeading(FEATURES)
     robot.observe(lines_at(0.0))
     before = robot.variance
-    robot.predict(turned(0.4, 0.1))
+    robot.predict(turn_motion(0.4, 0.1))
     assert robot.variance == pytest.approx(before + 0.01)
 
 
 def test_drives_are_measured():
-    rows = measured.headings(World("office", 1000), "", Configuration())
+    rows = measured.heading_errors(World("office", 1000), "", Configuration())
     assert len(rows) == 400
     assert np.abs(rows[:, 0]).max() < math.radians(1.5)
     assert np.abs(rows[:, 2]).max() > math.radians(5.0)

@@ -40,15 +40,15 @@ DOOR = np.array(
 PLACES = [np.array([0.1 * k, 0.05 * k, 0.3 * k]) for k in range(8)]
 
 
-def shown(walls, pose, seed=0):
+def extract_shown(walls, pose, seed=0):
     scan = scan_at(walls, pose, NOISE, np.random.default_rng(seed), 720)
     rays = rays_from_scan(scan, FEATURES)
     return extract_landmarks(extract_lines(scan, FEATURES), rays, FEATURES), rays
 
 
-def gathered(found, walls, places, first=0):
+def gather_landmarks(found, walls, places, first=0):
     for k, pose in enumerate(places):
-        found.observe(PoseGaussian(pose, np.diag([0.01, 0.01, 0.002]) ** 2), *shown(walls, pose, first + k))
+        found.observe(PoseGaussian(pose, np.diag([0.01, 0.01, 0.002]) ** 2), *extract_shown(walls, pose, first + k))
     return found
 
 
@@ -57,7 +57,7 @@ def of_kind(found, kind):
 
 
 def is_due(walls, pose, kind, landmark, width=0.0):
-    rays = shown(walls, pose)[1]
+    rays = extract_shown(walls, pose)[1]
     local = se2.between(np.asarray(pose, dtype=float), np.array([landmark], dtype=float))
     return bool(should_be_visible(np.array([kind]), local, np.array([width]), rays, FEATURES)[0])
 
@@ -104,9 +104,9 @@ def test_who_stands_before_an_opening_closes_none():
 
 
 def test_what_many_scans_show_is_one_landmark_each():
-    inner = of_kind(gathered(LandmarkMap(FEATURES), ROOM, PLACES), CONCAVE_CORNER)
+    inner = of_kind(gather_landmarks(LandmarkMap(FEATURES), ROOM, PLACES), CONCAVE_CORNER)
     assert len(inner) == 4
-    outer = of_kind(gathered(LandmarkMap(FEATURES), np.concatenate((ROOM, PILLAR)), PLACES), CONVEX_CORNER)
+    outer = of_kind(gather_landmarks(LandmarkMap(FEATURES), np.concatenate((ROOM, PILLAR)), PLACES), CONVEX_CORNER)
     places = np.array([one.pose.mean[:2] for one in inner])
     away = np.hypot(*(places[None] - np.array([(-3, -2), (5, -2), (5, 4), (-3, 4)])[:, None]).transpose(2, 0, 1))
     assert away.min(axis=1).max() < 0.03
@@ -117,27 +117,31 @@ def test_what_many_scans_show_is_one_landmark_each():
 def test_what_scans_have_in_common_makes_no_landmark_more_certain():
     """Covariance intersection: of like observations the covariance stays that of one."""
     certain = [
-        np.trace(of_kind(gathered(LandmarkMap(FEATURES), ROOM, [PLACES[0]] * count), CONCAVE_CORNER)[0].pose.covariance)
+        np.trace(
+            of_kind(gather_landmarks(LandmarkMap(FEATURES), ROOM, [PLACES[0]] * count), CONCAVE_CORNER)[
+                0
+            ].pose.covariance
+        )
         for count in (1, 10)
     ]
     assert certain[1] == pytest.approx(certain[0], rel=0.2)
 
 
 def test_a_door_has_its_width_and_is_gone_when_it_was_closed():
-    found = gathered(LandmarkMap(FEATURES), DOOR, PLACES)
+    found = gather_landmarks(LandmarkMap(FEATURES), DOOR, PLACES)
     (door,) = of_kind(found, OPENING)
     np.testing.assert_allclose(door.pose.mean, [1.0, -2.0, -0.5 * np.pi], atol=0.05)
     assert door.width == pytest.approx(1.0, abs=0.05)
     assert door.existence.probability > 0.9
-    gathered(found, np.concatenate((DOOR, [[0.5, -2.0, 1.5, -2.0]])), PLACES, first=20)
+    gather_landmarks(found, np.concatenate((DOOR, [[0.5, -2.0, 1.5, -2.0]])), PLACES, first=20)
     assert not of_kind(found, OPENING)
     assert len(of_kind(found, CONCAVE_CORNER)) >= 4
 
 
 def test_what_is_hidden_is_not_missed():
-    found = gathered(LandmarkMap(FEATURES), DOOR, PLACES)
+    found = gather_landmarks(LandmarkMap(FEATURES), DOOR, PLACES)
     (before,) = of_kind(found, OPENING)
-    gathered(found, np.concatenate((DOOR, box(-0.5, -1.8, 2.5, -0.8))), PLACES, first=20)
+    gather_landmarks(found, np.concatenate((DOOR, box(-0.5, -1.8, 2.5, -0.8))), PLACES, first=20)
     (after,) = (one for one in of_kind(found, OPENING) if one.pose is before.pose)
     assert after.existence == before.existence
 
@@ -148,7 +152,7 @@ def test_where_a_door_is_follows_from_how_far_its_sightings_are_apart(off, low, 
     stated = np.diag([0.02, 0.02, 0.005]) ** 2
     for k in range(12):
         believed = np.array([0.8, -0.5, 0.0]) + off * np.array([*rng.normal(size=2), 0.0])
-        found.observe(PoseGaussian(believed, stated), *shown(DOOR, np.array([0.8, -0.5, 0.0]), k))
+        found.observe(PoseGaussian(believed, stated), *extract_shown(DOOR, np.array([0.8, -0.5, 0.0]), k))
     (door,) = of_kind(found, OPENING)
     assert door.existence.detections >= 10
     across = np.sqrt(door.pose_from_scatter(scatter_ratio(found.landmarks)).covariance[0, 0])
@@ -159,7 +163,7 @@ def test_where_a_door_is_follows_from_how_far_its_sightings_are_apart(off, low, 
 def test_errors_of_scans_average_out_those_of_their_places_do_not():
     found = LandmarkMap(FEATURES)
     for k in range(8):
-        found.observe(PoseGaussian(np.zeros(3), np.diag([0.02, 0.02, 0.005]) ** 2), *shown(DOOR, PLACES[0], k))
+        found.observe(PoseGaussian(np.zeros(3), np.diag([0.02, 0.02, 0.005]) ** 2), *extract_shown(DOOR, PLACES[0], k))
     (door,) = of_kind(found, OPENING)
     stated = door.pose_from_scatter(8.0 * np.eye(3) - door.scatter).covariance
     across, along = np.sqrt(np.diag(stated)[:2] / np.diag(door.pose.covariance)[:2])
@@ -172,7 +176,7 @@ def test_the_scatter_of_sightings_that_are_vague_in_different_ways_is_one_of_squ
     for k, (x, y) in enumerate([(0.0, 0.0), (0.1, 0.0), (0.1, 0.1), (0.0, -0.1), (-0.1, 0.1)]):
         aslant = np.array([1.0, 1.0 if k % 2 else -1.0, 0.0]) * 0.2
         stated = np.outer(aslant, aslant) + np.diag([0.02, 0.02, 0.01]) ** 2
-        look = shown(DOOR, np.array([0.8, -0.5, 0.0]), k)
+        look = extract_shown(DOOR, np.array([0.8, -0.5, 0.0]), k)
         found.observe(PoseGaussian(np.array([0.8 + x, -0.5 + y, 0.0]), stated), *look)
     for door in of_kind(found, OPENING):
         assert np.linalg.eigvalsh(door.scatter).min() > -1e-9

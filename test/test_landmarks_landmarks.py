@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worlds import box, scan_at, scan_in
 
-from benchmark.landmark_truth import World
+from benchmark.landmark_truth import Surroundings
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
@@ -74,7 +74,7 @@ def test_the_corner_of_a_pillar_points_at_the_robot():
     np.testing.assert_allclose(convex[0], [1.0, 1.0, -0.75 * np.pi], atol=0.02)
 
 
-def test_corners_are_as_far_off_as_they_say():
+def test_corners_are_as_far_off_as_stated():
     nees = []
     for seed in range(60):
         pose = np.array([np.sin(seed), 0.5 * np.cos(seed), 0.7 * seed])
@@ -153,7 +153,7 @@ def test_a_gap_beside_furniture_is_hardly_an_opening():
     assert away.max() < 0.05 and openings.confidences[door] > 0.8
 
 
-def test_openings_are_as_far_off_as_they_say():
+def test_openings_are_as_far_off_as_stated():
     nees = []
     for seed in range(40):
         pose = np.array([2.5 + 0.01 * seed, 0.2 * np.sin(seed), 0.3 * seed])
@@ -180,11 +180,11 @@ def test_the_truth_of_a_drive_has_the_doors_of_its_building():
     doors, checked = scenario.building.doors.reshape(-1, 2, 2), 0
     for stamp in scenario.scan_stamps[100:600:25]:
         pose = scenario.true_poses(np.array([stamp]))[0]
-        world = World(scenario, int(stamp), pose)
+        world = Surroundings(scenario, int(stamp), pose)
         truth = world.openings(FEATURES)
         local = se2.transform(se2.inverse(pose), doors.reshape(-1, 2)).reshape(-1, 2, 2)
         middles, widths = local.mean(axis=1), np.hypot(*(local[:, 1] - local[:, 0]).T)
-        near = np.flatnonzero((np.hypot(*middles.T) < 2.0) & (np.hypot(*middles.T) > 0.6) & world.sees(middles))
+        near = np.flatnonzero((np.hypot(*middles.T) < 2.0) & (np.hypot(*middles.T) > 0.6) & world.is_visible(middles))
         for k in near:
             away = np.hypot(*(truth.poses[:, :2] - middles[k]).T)
             assert away.min() < 0.12
@@ -202,7 +202,9 @@ def test_a_door_that_is_closed_at_a_later_visit_is_no_true_opening():
     for stamp in before.scan_stamps[100:600:25]:
         pose = before.true_poses(np.array([stamp]))[0]
         local = se2.transform(se2.inverse(pose), doors.reshape(-1, 2)).reshape(-1, 2, 2).mean(axis=1)
-        seen = [World(scenario, int(stamp), pose).openings(FEATURES).poses[:, :2] for scenario in (before, after)]
+        seen = [
+            Surroundings(scenario, int(stamp), pose).openings(FEATURES).poses[:, :2] for scenario in (before, after)
+        ]
         for k in np.flatnonzero(np.hypot(*local.T) < 4.0):
             there = [bool(np.any(np.hypot(*(places - local[k]).T) < 0.12)) for places in seen]
             checked, open_before = checked + closed[k], open_before + there[0]

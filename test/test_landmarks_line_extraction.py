@@ -1,4 +1,4 @@
-"""The lines that scans show, as certain as they say."""
+"""The lines that scans show, as certain as stated."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 from worlds import box, scan_at, scan_in
 
 from benchmark import lines as measured
-from benchmark.line_truth import difference, lines_of, seen_in
+from benchmark.lines import line_difference, lines_of, true_scan
 from benchmark.simulated.worlds import World
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry import se2
@@ -28,7 +28,7 @@ def in_room(lines, pose):
 
 
 @pytest.mark.parametrize(("beams", "field_of_view"), [(91, np.pi), (361, np.pi), (1081, 1.5 * np.pi), (100, 1.0)])
-def test_lines_are_as_far_off_as_they_say(beams, field_of_view):
+def test_lines_are_as_far_off_as_stated(beams, field_of_view):
     nees = []
     for seed in range(100):
         pose = np.array([np.sin(seed), 0.5 * np.cos(seed), 0.7 * seed])
@@ -36,7 +36,7 @@ def test_lines_are_as_far_off_as_they_say(beams, field_of_view):
         lines = extract_lines(scan, FEATURES)
         walls = lines_of(se2.transform(se2.inverse(pose), ROOM.reshape(-1, 2)).reshape(-1, 4))
         for line, covariance in zip(lines.parameters, lines.covariances, strict=True):
-            errors = difference(line, walls)
+            errors = line_difference(line, walls)
             nees.append(np.einsum("ni,ij,nj->n", errors, np.linalg.inv(covariance), errors).min())
     assert len(nees) >= 100
     # The mean of so many is within three deviations of its own, and a few percent for beams that were left out.
@@ -128,16 +128,16 @@ def test_a_line_near_the_origin_is_itself_on_its_other_side():
 
 def test_lines_of_a_simulated_drive_are_measured_against_its_walls(monkeypatch):
     monkeypatch.setattr(measured, "_SCANS", 12)
-    scans = list(measured.scans_of(World("twins", 3), "field_of_view=360,beams=720,people=2", FEATURES))
+    scans = list(measured.extract_scans(World("twins", 3), "field_of_view=360,beams=720,people=2", FEATURES))
     assert len(scans) == 12
-    assert 0.8 < sum(scan.found for scan in scans) / sum(scan.shown for scan in scans) <= 1.0
+    assert 0.8 < sum(scan.found_length for scan in scans) / sum(scan.visible_length for scan in scans) <= 1.0
     assert measured.stray_share([scans]) < 0.05
     assert 1.0 < measured.mean_nees([scans]) < 4.0
-    assert 0.0 < measured.milliseconds([scans]) < 1000.0
+    assert 0.0 < measured.mean_milliseconds([scans]) < 1000.0
     scenario = open_simulated("sim:twins,seed=3,people=2,sweep=0.1").scenario
-    seen = seen_in(scenario, 40)
+    seen = true_scan(scenario, 40)
     assert np.hypot(*(seen.scan.points - seen.ends).T).max() < 0.1
-    assert set(np.unique(seen.met)) <= set(range(-1, len(seen.lines)))
+    assert set(np.unique(seen.hit_lines)) <= set(range(-1, len(seen.lines)))
 
 
 def test_a_map_is_given_apart_what_a_scan_joins_on_little_evidence():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from benchmark.one_drive import OneDrive
+from benchmark.one_drive import JoinedVisits
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.lifelong.change_detection import RecentScan, append_recent_scan, combine_stale_beams, detect_changes
 from hmt_slam_ros.messages.documents import KeyframeHeader, encode
@@ -40,7 +40,7 @@ def keyframes(walls):
     return [PlacedKeyframe(n, 0, scan_in(walls, pose, beams=361), pose) for n, pose in enumerate(WAY)]
 
 
-def news(before, now, looks=None):
+def changes(before, now, looks=None):
     """What a scan now says of a map of before."""
     scan = RecentScan(scan_in(now, NOW, stamp=10 * SECOND, beams=361), NOW)
     return detect_changes(scan, looks_in(now, now, now) if looks is None else looks, keyframes(before))
@@ -71,14 +71,14 @@ def test_a_view_of_a_laser_that_hangs_upside_down_or_moves_in_the_sweep_is_the_s
     assert classify_points(to_polar_scan(moving), places).tolist() == [SURFACE, FREE, UNKNOWN]
 
 
-def test_an_unchanged_room_is_no_news():
-    found = news(room(CUPBOARD), room(CUPBOARD))
+def test_an_unchanged_room_has_no_changes():
+    found = changes(room(CUPBOARD), room(CUPBOARD))
     assert (found.has_new_surface, found.has_changed_surface) == (False, False)
     assert not any(late.seen_through.any() or late.starts.any() for late in found.stale_beams.values())
 
 
 def test_furniture_that_came_is_stored_and_beams_that_pass_it_are_out_of_date():
-    found = news(room(), room(CUPBOARD))
+    found = changes(room(), room(CUPBOARD))
     assert found.has_changed_surface
     for keyframe in keyframes(room()):
         late = found.stale_beams[keyframe.keyframe]
@@ -89,7 +89,7 @@ def test_furniture_that_came_is_stored_and_beams_that_pass_it_are_out_of_date():
 
 
 def test_of_furniture_that_is_gone_every_beam_is_out_of_date():
-    found = news(room(CUPBOARD), room())
+    found = changes(room(CUPBOARD), room())
     for keyframe in keyframes(room(CUPBOARD)):
         gone = found.stale_beams[keyframe.keyframe].seen_through
         on = np.zeros(361, dtype=bool)
@@ -98,16 +98,16 @@ def test_of_furniture_that_is_gone_every_beam_is_out_of_date():
         assert (on == gone).mean() > 0.98
 
 
-def test_who_walks_through_is_no_news():
+def test_a_person_who_walks_through_is_no_change():
     """A person as wide as the cupboard, elsewhere at every look."""
     at = [box(x, -1.0, x + 0.4, -0.6) for x in (1.0, 1.6, 2.2)]
-    found = news(room(), room(box(2.8, -1.0, 3.2, -0.6)), looks_in(*(room(person) for person in at)))
+    found = changes(room(), room(box(2.8, -1.0, 3.2, -0.6)), looks_in(*(room(person) for person in at)))
     assert (found.has_new_surface, found.has_changed_surface) == (False, False)
     assert not any(late.seen_through.any() or late.starts.any() for late in found.stale_beams.values())
 
 
 def test_a_robot_that_is_elsewhere_takes_nothing_for_out_of_date():
-    found = news(room(), room() * [0.6, 0.4, 0.6, 0.4])
+    found = changes(room(), room() * [0.6, 0.4, 0.6, 0.4])
     assert not found.has_changed_surface
     assert not found.stale_beams
 
@@ -123,7 +123,7 @@ def test_looks_are_a_second_apart_and_few():
 
 
 def test_hypotheses_have_to_agree_on_what_is_out_of_date():
-    one, other = news(room(CUPBOARD), room()), news(room(), room())
+    one, other = changes(room(CUPBOARD), room()), changes(room(), room())
     assert combine_stale_beams([(one, 0.97), (other, 0.03)])
     assert combine_stale_beams([(one, 0.6), (other, 0.4)]) == ()
     assert combine_stale_beams([]) == ()
@@ -170,7 +170,7 @@ def read(run, records):
 @pytest.fixture(scope="module")
 def visits(tmp_path_factory):
     """The state after a visit; of a second one the keyframes, what was read of it, in two parts, and the states."""
-    log = OneDrive([open_simulated(WORLD.format(number)) for number in (1, 2)])
+    log = JoinedVisits([open_simulated(WORLD.format(number)) for number in (1, 2)])
     records, first = list(log.records()), log.scan_count // 2
     scans = np.cumsum([isinstance(record.measurement, Scan) for record in records])
     ends = [int(np.searchsorted(scans, count, side="right")) for count in (first, first + MIDDLE, first + END)]
@@ -182,15 +182,15 @@ def visits(tmp_path_factory):
     writer.write_state(middle)
     writer.finish(LIFELONG)
     rest = records[ends[1] : ends[2]]
-    said, after = read(run, rest)
-    return before, folder, rest, said, after
+    messages, after = read(run, rest)
+    return before, folder, rest, messages, after
 
 
 def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
-    before, _, _, said, after = visits
-    stored = [any(leaf.stored for leaf in message.estimates) for message in said]
+    before, _, _, messages, after = visits
+    stored = [any(hypothesis.stored for hypothesis in message.estimates) for message in messages]
     assert 0 < sum(stored) < 0.4 * len(stored)
-    assert all(message.mapping for message in said)
+    assert all(message.mapping for message in messages)
     scans = after.processes["slam"].replica.scans
     for replica in (
         after.processes["aam"].replica,
@@ -200,9 +200,9 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
     ):
         assert replica.scans.keys() == scans.keys()
         assert all(scan is scans[keyframe] for keyframe, scan in replica.scans.items())
-    told = [one for message in said for one in message.stale_beams]
-    assert all(isinstance(one, StaleBeams) for one in told)
-    old = [one for one in told if one.keyframe in before.processes["slam"].replica.scans and one.keyframe in scans]
+    reported = [one for message in messages for one in message.stale_beams]
+    assert all(isinstance(one, StaleBeams) for one in reported)
+    old = [one for one in reported if one.keyframe in before.processes["slam"].replica.scans and one.keyframe in scans]
     assert len(old) > 10
     for one in old:
         assert not scans[one.keyframe].valid[list(one.removed)].any()
@@ -213,12 +213,12 @@ def test_every_process_leaves_the_same_beams_out_and_little_is_stored(visits):
         assert (starts >= np.float32(one.starts)).all()
 
 
-def test_a_run_that_goes_on_from_its_state_says_the_same(visits):
-    _, folder, rest, said, _ = visits
+def test_a_run_that_goes_on_from_its_state_is_the_same(visits):
+    _, folder, rest, messages, _ = visits
     middle, _ = read_run_state(folder)
     assert any(live.event.recent_scans for live in middle.processes["slam"].live_hypotheses.values())
     again, _ = read(LockStepRun(LIFELONG, state=middle), rest)
-    same = said[-len(again) :]
+    same = messages[-len(again) :]
     assert [encode(KeyframeHeader.from_keyframe(one)) for one in again] == [
         encode(KeyframeHeader.from_keyframe(one)) for one in same
     ]

@@ -14,7 +14,7 @@ def revisit(pose, area=1, source=0, closure=False):
     return Hypothesis(0, 0, 1.0, area, belief(se2.inverse(pose)), (), (Arc(source, area, belief(pose), closure),))
 
 
-def test_an_arc_that_is_travelled_again_becomes_the_product_of_both_observations():
+def test_an_arc_that_is_traveled_again_becomes_the_product_of_both_observations():
     play = Play()
     play.start()
     first, second = [4.0, 0.0, 0.5], [4.1, 0.05, 0.49]
@@ -30,7 +30,7 @@ def test_an_arc_that_is_travelled_again_becomes_the_product_of_both_observations
     np.testing.assert_allclose(poses_of(verdict)[1].mean, product.mean, atol=1e-9)
 
 
-def test_an_arc_travelled_the_other_way_is_the_same_arc():
+def test_an_arc_traveled_the_other_way_is_the_same_arc():
     play = Play()
     play.start()
     first, second = [4.0, 0.0, 0.5], [4.1, 0.05, 0.49]
@@ -76,8 +76,8 @@ def test_the_same_keyframes_do_not_make_an_arc_more_certain_twice():
     pose = [4.0, 0.0, 0.0]
     play.step(places=[(0, 0, [4.5, 0.0, 0.0])])
     there = MovedKeyframe(1, 0, 1, np.array([0.5, 0.0, 0.0]))
-    leaf = Hypothesis(0, 0, 1.0, 1, belief(se2.inverse(pose)), (there,), (Arc(0, 1, belief(pose)),))
-    play.step(leaf)
+    hypothesis = Hypothesis(0, 0, 1.0, 1, belief(se2.inverse(pose)), (there,), (Arc(0, 1, belief(pose)),))
+    play.step(hypothesis)
     again = MovedKeyframe(1, 1, 1, np.array([0.5, 0.0, 0.0]))
     play.step(Hypothesis(0, 0, 1.0, 1, None, (again,), (Arc(0, 1, belief(pose)),)))
     np.testing.assert_allclose(play.arc(0, 1).covariance, SPREAD, rtol=1e-6, atol=1e-12)

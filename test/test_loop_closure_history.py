@@ -1,4 +1,4 @@
-"""Topological Loop Closure Acceptance: closures are aligned, spread over loops, doubted on contradiction."""
+"""Topological Loop Closure Acceptance: closures are aligned, spread over loops, revised on contradiction."""
 
 from dataclasses import replace
 
@@ -24,12 +24,12 @@ def closing_play(error, spread=SPREAD, refinement=0):
     for i, pose in enumerate(ROOM_B):
         area, where = (0, se2.between(ROOM_A[0], pose)) if i == 0 else (1, se2.between(ROOM_B[0], pose))
         moved = MovedKeyframe(first, 0, 1, np.zeros(3))
-        leaf = (
+        hypothesis = (
             Hypothesis(0, 0, 1.0, 1, belief(se2.inverse(a_T_b)), (moved,), (Arc(0, 1, belief(a_T_b)),))
             if i == 0
             else Hypothesis(0, 0, 1.0, 1)
         )
-        play.step(leaf, places=[(0, area, where)], world=pose)
+        play.step(hypothesis, places=[(0, area, where)], world=pose)
     back = worlds.drive((3.5, 2.0), (2.0, 3.5))
     first = play.k + 1
     for pose in back[:-1]:
@@ -37,8 +37,8 @@ def closing_play(error, spread=SPREAD, refinement=0):
     in_b, in_a = se2.between(ROOM_B[0], back), se2.compose(error, se2.between(ROOM_A[0], back))
     b_T_a = se2.compose(in_b[0], se2.inverse(in_a[0]))
     moved = tuple(MovedKeyframe(first + i, 1, 0, pose) for i, pose in enumerate(in_a))
-    leaf = Hypothesis(0, 0, 1.0, 0, belief(se2.inverse(b_T_a)), moved, (Arc(1, 0, belief(b_T_a, spread), True),))
-    verdict = play.step(leaf, places=[(0, 1, in_b[-1])], world=back[-1])
+    hypothesis = Hypothesis(0, 0, 1.0, 0, belief(se2.inverse(b_T_a)), moved, (Arc(1, 0, belief(b_T_a, spread), True),))
+    verdict = play.step(hypothesis, places=[(0, 1, in_b[-1])], world=back[-1])
     return play, verdict, first, se2.between(ROOM_A[0], back), a_T_b
 
 
@@ -88,17 +88,17 @@ def test_an_arc_found_between_areas_that_keep_their_keyframes_is_finely_aligned(
     assert abs(np.degrees(off[2])) < 0.3
 
 
-def test_a_closure_that_claims_to_be_certain_is_not_moved_beyond_its_gate():
+def test_a_closure_with_a_large_certainty_is_not_moved_beyond_its_gate():
     error = np.array([0.2, -0.15, 0.0])
     _, verdict, *_ = closing_play(error, np.diag([0.01**2, 0.01**2, 0.005**2]))
     assert verdict.moved_keyframes == ()
 
 
-def test_a_loop_is_spread_over_its_arcs_or_left_open_as_asked_for():
+def test_a_loop_is_spread_over_its_arcs_or_left_open_as_requested():
     quarter = np.radians(88.0)
     step = [2.0, 0.0, quarter]
 
-    def around(**changes):
+    def close_ring(**changes):
         play = Play(**changes)
         play.start()
         for area in (1, 2, 3):
@@ -108,15 +108,15 @@ def test_a_loop_is_spread_over_its_arcs_or_left_open_as_asked_for():
         poses = np.array([poses_of(verdict)[area].mean for area in (0, 1, 2, 3, 0)])
         return play, np.degrees(se2.between(poses[:-1], poses[1:])[:, 2])
 
-    play, turns = around()
+    play, turns = close_ring()
     np.testing.assert_allclose(turns, 90.0, atol=1e-6)
     tree = np.array([play.process.shortest_path_poses()[area].mean for area in (0, 1, 2, 3, 0)])
-    _, turns = around(global_map="shortest_path")
+    _, turns = close_ring(global_map="shortest_path")
     np.testing.assert_allclose(turns, np.degrees(se2.between(tree[:-1], tree[1:])[:, 2]), atol=1e-9)
     assert np.ptp(turns) > 5.0
 
 
-def test_an_arc_that_refuses_to_fit_is_told_once():
+def test_an_arc_that_refuses_to_fit_is_reported_once():
     play = Play()
     play.start()
     for area in (1, 2, 3):
@@ -124,9 +124,9 @@ def test_an_arc_that_refuses_to_fit_is_told_once():
     play.step(Hypothesis(0, 0, 1.0, 0, belief(np.zeros(3)), (), (Arc(3, 0, belief([9.0, 0.0, 0.0])),)))
     assert len(play.notices) >= 1
     assert "between areas" in play.notices[0].text
-    told = {notice.text.split(" misses")[0] for notice in play.notices}
+    reported = {notice.text.split(" misses")[0] for notice in play.notices}
     play.step(new_area(0, 0, 1.0, 4, [2.0, 0.0, 0.0]))
-    assert len(told) == len(play.notices)
+    assert len(reported) == len(play.notices)
 
 
 def test_the_same_messages_give_the_same_verdicts():
@@ -156,7 +156,7 @@ def two_loops(play, false_closure):
     return play.step(Hypothesis(0, 0, 1.0, 4, None, (), (other,)))
 
 
-def test_a_contradiction_is_told_to_tsbi_and_the_map_is_not_bent_by_it():
+def test_a_contradiction_is_sent_to_tsbi_and_the_map_is_not_bent_by_it():
     play = Play(arc_sigma_floor=1e-4, arc_angle_floor=1e-3)
     before = two_loops(play, false_closure=True)
     assert before.hypothesis == 0
@@ -180,8 +180,8 @@ def test_a_question_that_is_open_again_is_closed_as_any_other():
     play = Play(arc_sigma_floor=1e-4, arc_angle_floor=1e-3, accept_distance=0.0, accept_probability=0.98)
     best, second, *_ = two_loops(play, false_closure=True).revised_hypotheses
     assert [(ends.source, ends.target) for ends in second.removed_arcs] == [(0, 4)]
-    leaves = replace(best, id=1, probability=0.99), replace(second, id=2, probability=0.01)
-    assert play.step(*leaves).hypothesis is None
+    hypotheses = replace(best, id=1, probability=0.99), replace(second, id=2, probability=0.01)
+    assert play.step(*hypotheses).hypothesis is None
     both = Hypothesis(1, 1, 0.99, 4), Hypothesis(2, 2, 0.01, 4)
     assert [play.step(*both).hypothesis for _ in range(2)] == [None, 1]
     assert play.arc(0, 2, 1) is None

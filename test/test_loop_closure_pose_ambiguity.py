@@ -17,11 +17,11 @@ def verdict_of(probability):
     """The robot is in area 2, at the end of one of two arcs."""
     play = Play()
     play.start()
-    leaves = [
+    hypotheses = [
         Hypothesis(h, 0, p, 2, belief(se2.inverse(THERE)), (), (Arc(0, 2, belief(arc)),))
         for h, p, arc in ((1, probability, THERE), (2, 1.0 - probability, ELSEWHERE))
     ]
-    return play.step(*leaves)
+    return play.step(*hypotheses)
 
 
 def test_one_hypothesis_is_not_ambiguous():
@@ -39,12 +39,12 @@ def test_it_is_what_the_others_are_away_by_their_probability(probability):
 def test_the_pose_in_the_map_is_as_uncertain_as_the_hypotheses_are_apart_whatever_the_heading():
     exact = PoseGaussian.from_pose
     apart = np.diag([4.0, 0.0, 0.0])
-    said = [
+    messages = [
         RealTimePose(
             0, 0, exact(np.zeros(3)), exact(np.array([1.0, 2.0, turn])), exact(np.zeros(3)), np.zeros(3), apart
         )
         for turn in (0.0, 0.5 * np.pi)
     ]
-    np.testing.assert_allclose(said[0].map_pose.covariance, np.diag([4.0, 0.0, 0.0]), atol=1e-12)
-    np.testing.assert_allclose(said[1].map_pose.covariance, np.diag([0.0, 4.0, 0.0]), atol=1e-12)
-    np.testing.assert_allclose(said[1].pose_in_area.covariance, 0.0, atol=1e-12)
+    np.testing.assert_allclose(messages[0].map_pose.covariance, np.diag([4.0, 0.0, 0.0]), atol=1e-12)
+    np.testing.assert_allclose(messages[1].map_pose.covariance, np.diag([0.0, 4.0, 0.0]), atol=1e-12)
+    np.testing.assert_allclose(messages[1].pose_in_area.covariance, 0.0, atol=1e-12)

@@ -22,7 +22,7 @@ CLOSURE = np.diag([0.2**2, 0.2**2, 0.05**2])
 TRAVELLED = np.diag([0.03**2, 0.03**2, 0.01**2])
 
 
-def visited(bend=0.0, seed=0):
+def make_areas(bend=0.0, seed=0):
     """Areas in frames at their first keyframes; the closing arc is off by ERROR, area 2 is bent, rad a keyframe."""
     hybrid_map, scans, truth, k = HybridMap(), {}, {}, 0
     for area, poses in VISITS.items():
@@ -38,14 +38,14 @@ def visited(bend=0.0, seed=0):
     return hybrid_map, scans, truth
 
 
-def refined(hybrid_map, scans, closed=(0, 2), **changes):
+def refine(hybrid_map, scans, closed=(0, 2), **changes):
     return ClosureRefinement(with_changes(Configuration(), changes)).refine(hybrid_map, scans, set(closed))
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.004])
 def test_the_closing_arc_and_the_keyframes_of_both_areas_come_to_where_their_scans_agree(bend):
-    hybrid_map, scans, truth = visited(bend)
-    found = refined(hybrid_map, scans)
+    hybrid_map, scans, truth = make_areas(bend)
+    found = refine(hybrid_map, scans)
     assert found.keyframes.keys() == {0, 2}
     arc = found.arcs[0, 2].mean
     for k, pose in found.keyframes[2].items():
@@ -55,8 +55,8 @@ def test_the_closing_arc_and_the_keyframes_of_both_areas_come_to_where_their_sca
 
 
 def test_the_frame_of_an_area_stays_where_its_keyframes_move_least():
-    hybrid_map, scans, _ = visited(bend=0.004)
-    found = refined(hybrid_map, scans)
+    hybrid_map, scans, _ = make_areas(bend=0.004)
+    found = refine(hybrid_map, scans)
     for area, keyframes in found.keyframes.items():
         before, after = np.array(list(hybrid_map.keyframes(area).values())), np.array(list(keyframes.values()))
         np.testing.assert_allclose((after - before)[:, :2].mean(axis=0), 0.0, atol=1e-9)
@@ -64,8 +64,8 @@ def test_the_frame_of_an_area_stays_where_its_keyframes_move_least():
 
 
 def test_an_area_beside_the_closure_moves_as_a_whole_if_at_all():
-    hybrid_map, scans, _ = visited()
-    found = refined(hybrid_map, scans)
+    hybrid_map, scans, _ = make_areas()
+    found = refine(hybrid_map, scans)
     assert 1 not in found.keyframes
     moved = se2.between(hybrid_map.arc(0, 1).mean, found.arcs[0, 1].mean)
     assert np.hypot(*moved[:2]) < 0.03
@@ -74,8 +74,8 @@ def test_an_area_beside_the_closure_moves_as_a_whole_if_at_all():
 def test_the_closing_arc_is_far_more_certain_and_not_too_much_so_and_one_to_an_area_beside_as_before():
     squared = []
     for seed in range(8):
-        hybrid_map, scans, truth = visited(seed=seed)
-        found = refined(hybrid_map, scans)
+        hybrid_map, scans, truth = make_areas(seed=seed)
+        found = refine(hybrid_map, scans)
         np.testing.assert_allclose(found.arcs[0, 1].covariance, TRAVELLED, atol=1e-12)
         arc, frames = found.arcs[0, 2], {}
         for area, first in ((0, 0), (2, min(found.keyframes[2]))):
@@ -95,13 +95,13 @@ def test_along_a_bare_corridor_the_closing_arc_stays_uncertain():
             hybrid_map.set_keyframe(k, area, np.array([0.5 * i, 0.0, 0.0]))
             scans[k] = worlds.scan_in(walls, np.array([start + 0.5 * i, 0.0, 0.0]), noise=0.01, seed=k)
     hybrid_map.set_arc(0, 1, PoseGaussian(np.array([1.3, 0.0, 0.0]), CLOSURE), closure=True)
-    deviations = np.sqrt(np.diag(refined(hybrid_map, scans, (0, 1)).arcs[0, 1].covariance))
+    deviations = np.sqrt(np.diag(refine(hybrid_map, scans, (0, 1)).arcs[0, 1].covariance))
     assert deviations[0] == pytest.approx(0.2, rel=0.1)
     assert deviations[1] < 0.03
 
 
 def test_closures_far_from_each_other_are_refined_each_for_itself():
-    hybrid_map, scans, _ = visited()
+    hybrid_map, scans, _ = make_areas()
     far, first = HybridMap(), len(scans)
     for area in hybrid_map.area_ids():
         for k, pose in hybrid_map.keyframes(area).items():
@@ -116,7 +116,7 @@ def test_closures_far_from_each_other_are_refined_each_for_itself():
     far.set_keyframe(2 * first + 1, 6, np.zeros(3))
     for a, b in ((1, 5), (5, 6), (6, 11)):
         far.set_arc(a, b, PoseGaussian(np.array([30.0, 0.0, 0.0]), TRAVELLED), closure=False)
-    alone, both = refined(hybrid_map, scans), refined(far, scans, (0, 2, 10, 12))
+    alone, both = refine(hybrid_map, scans), refine(far, scans, (0, 2, 10, 12))
     assert both.keyframes.keys() == {0, 2, 10, 12}
     for pair in ((0, 2), (10, 12)):
         np.testing.assert_allclose(both.arcs[pair].mean, alone.arcs[0, 2].mean, atol=1e-6)
@@ -124,6 +124,6 @@ def test_closures_far_from_each_other_are_refined_each_for_itself():
 
 
 def test_without_iterations_nothing_changes():
-    hybrid_map, scans, _ = visited()
-    found = refined(hybrid_map, scans, **{"refinement.iterations": 0})
+    hybrid_map, scans, _ = make_areas()
+    found = refine(hybrid_map, scans, **{"refinement.iterations": 0})
     assert found.keyframes == found.arcs == {}

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from misled import misled, run
+from make_misled import make_misled, run
 from ring_for_tsbi import RING, Run, ring_drive
 
 from hmt_slam_ros.configuration import Configuration
@@ -33,7 +33,7 @@ ODOMETRY, MATCH = np.diag([0.3, 0.3, 0.02]) ** 2, np.diag([0.05, 0.05, 0.01]) **
 NEXT = np.array([4.0, 0.0, 0.0])  # from the frame of an area to that of the next
 
 
-def around(a, b):
+def true_motion(a, b):
     """Truth: ``a_T_b`` of areas along a straight corridor."""
     return (b - a) * NEXT
 
@@ -50,8 +50,8 @@ def corridor(areas):
     return hybrid_map, history
 
 
-def closed(hybrid_map, event, near, far, error=(0.0, 0.0, 0.0), log_odds=4.6):
-    belief = PoseGaussian(se2.compose(around(near, far), np.array(error)), MATCH)
+def make_closure(hybrid_map, event, near, far, error=(0.0, 0.0, 0.0), log_odds=4.6):
+    belief = PoseGaussian(se2.compose(true_motion(near, far), np.array(error)), MATCH)
     hybrid_map.set_arc(near, far, belief, closure=True)
     return Closure((event, (min(near, far), max(near, far))), near, far, belief, log_odds, MapSnapshot({}, {}))
 
@@ -69,63 +69,63 @@ def drive_with(*found, areas=8, area=7):
     hybrid_map, history = corridor(areas)
     closures = []
     for event, near, far, error in found:
-        closures.append(closed(hybrid_map, event, near, far, error))
+        closures.append(make_closure(hybrid_map, event, near, far, error))
         history += (PathStep(event, near, near, (closures[-1].pair,)),)
     return account_of(hybrid_map, history, closures, area)
 
 
-def doubt_of(account, event):
+def inconsistency_of(account, event):
     return ClosureConsistencyCheck(account, BOUND, 100).find_inconsistency(
         [c.closure_id for c in account.closures if c.closure_id[0] == event], 0.01
     )
 
 
-def test_closures_that_agree_raise_no_doubt():
+def test_closures_that_agree_raise_no_inconsistency():
     account = drive_with((80, 7, 0, (0.05, 0.0, 0.0)), (81, 6, 1, (0.0, -0.05, 0.0)), (82, 7, 2, (0.0, 0.0, 0.0)))
-    assert doubt_of(account, 82) is None
+    assert inconsistency_of(account, 82) is None
 
 
 def test_a_false_closure_is_found_when_true_ones_contradict_it():
     """It fits the odometry alone."""
     account = drive_with((80, 6, 0, FALSE))
-    assert doubt_of(account, 80) is None
+    assert inconsistency_of(account, 80) is None
     account = drive_with((80, 6, 0, FALSE), (81, 7, 1, TRUE))
-    doubt = doubt_of(account, 81)
-    assert doubt.closure.closure_id[0] == 81
-    assert doubt.excess_chi2 > BOUND
-    assert [c.closure_id[0] for c in doubt.explanations[0].false_closures] == [80]
-    assert doubt.explanations[0].probability > 0.9
+    inconsistency = inconsistency_of(account, 81)
+    assert inconsistency.closure.closure_id[0] == 81
+    assert inconsistency.excess_chi2 > BOUND
+    assert [c.closure_id[0] for c in inconsistency.explanations[0].false_closures] == [80]
+    assert inconsistency.explanations[0].probability > 0.9
 
 
 def test_where_two_closures_contradict_each_other_both_may_be_false():
     account = drive_with((80, 6, 0, FALSE), (81, 7, 1, (-2.2, 0.0, 0.0)))
-    doubt = doubt_of(account, 81)
-    assert sorted(c.closure_id[0] for e in doubt.explanations for c in e.false_closures) == [80, 81]
-    assert [e.probability for e in doubt.explanations] == pytest.approx([0.5, 0.5], abs=0.01)
+    inconsistency = inconsistency_of(account, 81)
+    assert sorted(c.closure_id[0] for e in inconsistency.explanations for c in e.false_closures) == [80, 81]
+    assert [e.probability for e in inconsistency.explanations] == pytest.approx([0.5, 0.5], abs=0.01)
 
 
 def test_the_odds_at_which_a_closure_was_accepted_speak_for_it():
     account = drive_with((80, 6, 0, FALSE), (81, 7, 1, (-2.2, 0.0, 0.0)))
     closures = (account.closures[0], replace(account.closures[1], log_odds=10.0))
-    doubt = doubt_of(replace(account, closures=closures), 81)
-    assert [[c.closure_id[0] for c in e.false_closures] for e in doubt.explanations] == [[80]]
+    inconsistency = inconsistency_of(replace(account, closures=closures), 81)
+    assert [[c.closure_id[0] for c in e.false_closures] for e in inconsistency.explanations] == [[80]]
 
 
 def test_closures_that_were_accepted_because_of_a_false_one_go_with_it_and_true_ones_stay():
     shifted = (80, 6, 0, FALSE), (81, 6, 1, FALSE), (82, 7, 2, FALSE)
     account = drive_with((79, 3, 0, TRUE), *shifted, (90, 5, 3, TRUE), (91, 7, 4, TRUE))
-    doubt = doubt_of(account, 91)
-    best = doubt.explanations[0]
+    inconsistency = inconsistency_of(account, 91)
+    best = inconsistency.explanations[0]
     assert [c.closure_id[0] for c in best.false_closures] == [80, 81, 82]
     assert best.probability > 0.99
     assert [c.closure_id[0] for c in best.path.closures] == [79, 90, 91]
 
 
-def joined():
+def false_account():
     """From area 3 the robot falsely enters area 0: it stores keyframes 41, 42 there, goes on to area 1, stores 45, and
     leaves it for area 4, which is new."""
     hybrid_map, history = corridor(4)
-    closure = closed(hybrid_map, 40, 3, 0)
+    closure = make_closure(hybrid_map, 40, 3, 0)
     hybrid_map.set_keyframe(39, 0, np.array([0.2, 0.1, 0.0]))
     hybrid_map.set_keyframe(41, 0, np.array([0.5, 0.1, 0.0]))
     hybrid_map.set_keyframe(42, 0, np.array([1.0, 0.1, 0.0]))
@@ -149,7 +149,7 @@ def in_frame_of(hybrid_map, *areas):
 
 
 def test_what_was_stored_in_areas_that_were_entered_falsely_becomes_an_area_of_its_own():
-    before = joined()
+    before = false_account()
     found = withdraw_closure(before, before.closures[0].closure_id, 9)
     hybrid_map = found.hybrid_map
     assert {a: sorted(hybrid_map.keyframes(a)) for a in hybrid_map.area_ids()} == {
@@ -178,7 +178,7 @@ def test_what_was_stored_in_areas_that_were_entered_falsely_becomes_an_area_of_i
 
 
 def test_a_robot_that_is_in_an_area_falsely_is_then_in_the_new_one():
-    before = joined()
+    before = false_account()
     hybrid_map = before.hybrid_map.branch()
     hybrid_map.remove_arc(1, 4)
     found = withdraw_closure(
@@ -201,7 +201,7 @@ def test_a_link_that_the_robot_never_crossed_is_only_taken_out():
 def test_what_a_refinement_moved_goes_back_and_what_was_stored_since_goes_with_it():
     hybrid_map, history = corridor(4)
     bent = np.array([0.3, 0.2, 0.05])
-    closure = closed(hybrid_map, 40, 3, 0)
+    closure = make_closure(hybrid_map, 40, 3, 0)
     former = {k: (3, hybrid_map.keyframes(3)[k].copy()) for k in (30, 31)}
     undo = MapSnapshot(former, {(2, 3): ArcValue(PoseGaussian(NEXT, ODOMETRY), closure=False)})
     for k in (30, 31):
@@ -231,7 +231,7 @@ def test_an_area_that_became_part_of_another_is_that_one_in_the_account():
     account = drive_with((80, 6, 3, TRUE), (81, 7, 1, FALSE), (82, 6, 0, TRUE))
     history, closures = apply_area_merge(account, AreaMerge(6, 3, account.hybrid_map.arc(3, 6)))
     assert [(c.closure_id[0], c.near, c.far) for c in closures] == [(81, 7, 1), (82, 3, 0)]
-    np.testing.assert_allclose(closures[1].pose.mean, around(3, 0), atol=1e-9)
+    np.testing.assert_allclose(closures[1].pose.mean, true_motion(3, 0), atol=1e-9)
     steps = [(step.event, step.area_before, step.area_after, step.new_arcs) for step in history]
     assert steps[4:] == [
         (50, 4, 5, ((4, 5),)),
@@ -264,7 +264,7 @@ def test_what_a_refinement_moved_goes_back_after_an_area_became_part_of_another(
     for k, (area, pose) in former.items():
         hybrid_map.set_keyframe(k, area, se2.compose(bent, pose))
     arcs = {pair: hybrid_map.arc_value(*pair) for pair in ((1, 2), (2, 3))}
-    closure = replace(closed(hybrid_map, 40, 2, 0), snapshot=MapSnapshot(former, arcs))
+    closure = replace(make_closure(hybrid_map, 40, 2, 0), snapshot=MapSnapshot(former, arcs))
     account = account_of(hybrid_map, history, [closure], 2)
     history, closures = apply_area_merge(account, AreaMerge(3, 2, account.hybrid_map.arc(2, 3)))
     assert set(closures[0].snapshot.keyframes) == {20, 21}
@@ -302,7 +302,7 @@ def test_tsbi_goes_on_with_the_explanations_as_live_hypotheses():
     assert sorted(r.keyframe for r in one.moved_keyframes) == [5, 6, 7, 8]
     assert sorted(run.replica.maps[one.id].keyframes(0)) == list(range(9))
     assert one.local_areas[0].area == 0
-    assert [leaf.removed_arcs for leaf in run.keyframe(ring_drive(10)[9]).hypotheses] == [(), ()]
+    assert [hypothesis.removed_arcs for hypothesis in run.keyframe(ring_drive(10)[9]).hypotheses] == [(), ()]
 
 
 LOG = "sim:ring,seed=3,size=1.5"
@@ -314,7 +314,7 @@ def drives():
 
     By itself the false closure is within what is admitted of a cycle.
     """
-    return run(open_log(LOG), Configuration()), run(open_log(LOG), Configuration(), misled(2, 0, 3.8))
+    return run(open_log(LOG), Configuration()), run(open_log(LOG), Configuration(), make_misled(2, 0, 3.8))
 
 
 def arcs(recording):
@@ -325,9 +325,9 @@ def test_a_closure_that_was_accepted_falsely_is_withdrawn_when_the_true_one_come
     (without_it, _), (with_it, _) = drives
     accepted = {row.keyframe: row for row in with_it.probabilities if row.accepted}
     assert min(k for k, row in accepted.items() if row.closures) < 80  # definite, long before the true one
-    (told,) = [notice.text for notice in with_it.notices if notice.process == "tlca"]
-    assert "closure between areas 0 and 4 contradicts" in told
-    assert "of all closures 2-0 is taken for false" in told
+    (reported,) = [notice.text for notice in with_it.notices if notice.process == "tlca"]
+    assert "closure between areas 0 and 4 contradicts" in reported
+    assert "of all closures 2-0 is taken for false" in reported
     assert arcs(with_it) == arcs(without_it)
     assert with_it.hybrid_map.arc(0, 2) is None
     assert with_it.replica.probabilities[with_it.replica.best_hypothesis] == 1.0
@@ -360,7 +360,7 @@ def test_every_process_has_the_same_map_from_messages_alone(drives):
                 np.testing.assert_array_equal(arc.pose.mean, other.pose.mean)
 
 
-def test_a_true_closure_is_not_doubted(drives):
+def test_a_true_closure_is_not_rejected(drives):
     recording, _ = drives[0]
     assert [notice for notice in recording.notices if notice.process == "tlca"] == []
     assert any(arc.closure for _, _, arc in recording.hybrid_map.all_arcs())

@@ -16,7 +16,7 @@ def test_the_first_area_lies_at_the_origin_of_the_map_with_hardly_any_uncertaint
     assert 0.0 < np.trace(poses_of(verdict)[0].covariance) < 1e-6
 
 
-def test_nothing_is_said_where_nothing_changed():
+def test_nothing_is_sent_where_nothing_changed():
     play = Play()
     play.start()
     verdict = play.step(places=[(0, 0, [0.5, 0.0, 0.0])])
@@ -33,7 +33,7 @@ def test_the_one_hypothesis_left_is_accepted_at_once_and_its_new_area_is_placed(
     np.testing.assert_allclose(poses_of(verdict)[1].covariance, SPREAD, atol=1e-9)
 
 
-def parted(play, dominant=0.95):
+def branch(play, dominant=0.95):
     play.start()
     return play.step(new_area(1, 0, dominant, 1, [4.0, 0.0, 0.5]), new_area(2, 0, 1.0 - dominant, 1, [4.0, 1.0, 0.5]))
 
@@ -44,32 +44,32 @@ def both(dominant=0.95):
 
 def test_a_dominant_path_is_accepted_after_enough_keyframes_since_the_paths_parted():
     play = Play(accept_distance=0.0)
-    assert parted(play).hypothesis is None
+    assert branch(play).hypothesis is None
     assert [play.step(*both()).hypothesis for _ in range(2)] == [None, 1]
 
 
-def test_a_dominant_path_is_accepted_after_enough_metres_since_the_paths_parted():
+def test_a_dominant_path_is_accepted_after_enough_meters_since_the_paths_parted():
     play = Play(accept_keyframes=1, accept_distance=2.0)
-    assert parted(play).hypothesis is None  # parted at 0.5 m
-    assert [play.step(*both(), travelled=t).hypothesis for t in (1.0, 2.4, 2.5)] == [None, None, 1]
+    assert branch(play).hypothesis is None  # parted at 0.5 m
+    assert [play.step(*both(), traveled=t).hypothesis for t in (1.0, 2.4, 2.5)] == [None, None, 1]
 
 
 def test_keyframes_count_only_in_a_row():
     play = Play(accept_distance=0.0)
-    parted(play)
+    branch(play)
     verdicts = [play.step(*both(p)).hypothesis for p in (0.95, 0.5, 0.95, 0.95, 0.95)]
     assert verdicts == [None, None, None, None, 1]
 
 
 def test_an_undecided_question_stays_open():
     play = Play()
-    parted(play, 0.6)
+    branch(play, 0.6)
     assert all(play.step(*both(0.6)).hypothesis is None for _ in range(10))
 
 
-def test_branching_again_starts_the_count_anew():
+def test_branching_again_starts_the_count_again():
     play = Play(accept_distance=0.0)
-    parted(play)
+    branch(play)
     play.step(*both())
     again = (
         new_area(3, 1, 0.92, 2, [3.0, 0.0, 0.0], source=1),
@@ -77,12 +77,12 @@ def test_branching_again_starts_the_count_anew():
         Hypothesis(2, 2, 0.02, 1),
     )
     rest = (Hypothesis(3, 3, 0.92, 2), Hypothesis(4, 4, 0.06, 2), Hypothesis(2, 2, 0.02, 1))
-    assert [play.step(*leaves).hypothesis for leaves in (again, rest, rest)] == [None, None, 3]
+    assert [play.step(*hypotheses).hypothesis for hypotheses in (again, rest, rest)] == [None, None, 3]
 
 
 def test_after_acceptance_only_the_accepted_hypothesis_goes_on():
     play = Play(accept_distance=0.0)
-    parted(play)
+    branch(play)
     while play.step(*both()).hypothesis is None:
         pass
     verdict = play.step(Hypothesis(1, 1, 1.0, 1))
@@ -92,7 +92,7 @@ def test_after_acceptance_only_the_accepted_hypothesis_goes_on():
 
 def test_global_poses_follow_the_most_probable_hypothesis():
     play = Play()
-    verdict = parted(play, 0.6)
+    verdict = branch(play, 0.6)
     np.testing.assert_allclose(poses_of(verdict)[1].mean, [4.0, 0.0, 0.5], atol=1e-9)
     assert play.step(*both(0.6)).global_poses == ()
     verdict = play.step(*both(0.4))

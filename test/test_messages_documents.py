@@ -117,8 +117,8 @@ def test_a_keyframe_is_whole_again_with_its_ranges():
     ranges = np.array([1.0, np.nan, np.inf, 0.1], dtype=np.float32)
     scan = Scan(5, ranges, -1.1, 0.1, 0.05, 30.0, np.array([0.1, 0.2, 0.3]), 1e-5)
     pose = PoseGaussian(np.array([1.0, 2.0, 0.1]), np.eye(3))
-    leaf = HypothesisEstimate(3, 4, pose, True, -0.3, 0.2, Clutter(0.01, 0.002), 11.5)
-    keyframe = Keyframe(2, scan, 1.25, (leaf,))
+    child = HypothesisEstimate(3, 4, pose, True, -0.3, 0.2, Clutter(0.01, 0.002), 11.5)
+    keyframe = Keyframe(2, scan, 1.25, (child,))
     assert_same(decode(encode(KeyframeHeader.from_keyframe(keyframe)), KeyframeHeader).to_keyframe(ranges), keyframe)
 
 

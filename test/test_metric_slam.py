@@ -40,51 +40,51 @@ def drive(count, start=0):
 
 def agree(keyframe):
     """The answer that changes nothing."""
-    leaves = tuple(
-        Hypothesis(leaf.hypothesis, leaf.hypothesis, 1.0 / len(keyframe.estimates), leaf.area)
-        for leaf in keyframe.estimates
+    children = tuple(
+        Hypothesis(hypothesis.hypothesis, hypothesis.hypothesis, 1.0 / len(keyframe.estimates), hypothesis.area)
+        for hypothesis in keyframe.estimates
     )
-    return [Hypotheses(keyframe.sequence, leaves), ClosureDecision(keyframe.sequence)]
+    return [Hypotheses(keyframe.sequence, children), ClosureDecision(keyframe.sequence)]
 
 
 class Dialogue:
-    """A metric SLAM process, and everything that it said."""
+    """A metric SLAM process, and all messages that it sent."""
 
     def __init__(self, configuration=None, answer=agree):
         self.slam = MetricSlam(configuration or Configuration())
         self.answer = answer
-        self.said = []
+        self.sent = []
 
-    def tell(self, *messages):
+    def send(self, *messages):
         pending = list(messages)
         while pending:
             for message in self.slam.handle(pending.pop(0)):
-                self.said.append(message)
+                self.sent.append(message)
                 if isinstance(message, Keyframe):
                     pending += self.answer(message)
         return self
 
-    def of(self, kind):
-        return [message for message in self.said if isinstance(message, kind)]
+    def messages_of(self, kind):
+        return [message for message in self.sent if isinstance(message, kind)]
 
 
 def test_every_scan_gets_a_pose_near_the_truth():
     dialogue = Dialogue()
     truths = []
     for odometry, scan, pose in drive(60):
-        dialogue.tell(odometry, scan)
+        dialogue.send(odometry, scan)
         truths.append(pose)
-    estimates = dialogue.of(LocalEstimate)
+    estimates = dialogue.messages_of(LocalEstimate)
     assert [estimate.scan_index for estimate in estimates] == list(range(60))
     errors = np.array([se2.between(t, e.pose.mean) for t, e in zip(truths, estimates, strict=True)])
     assert np.hypot(*errors[:, :2].T).max() < 0.05
 
 
-def test_a_keyframe_comes_with_every_half_metre():
+def test_a_keyframe_comes_with_every_half_meter():
     dialogue = Dialogue()
     for odometry, scan, _ in drive(61):
-        dialogue.tell(odometry, scan)
-    keyframes = dialogue.of(Keyframe)
+        dialogue.send(odometry, scan)
+    keyframes = dialogue.messages_of(Keyframe)
     assert [keyframe.sequence for keyframe in keyframes] == list(range(len(keyframes)))
     assert len(keyframes) in range(11, 14)
     assert all(keyframe.estimates[0].stored for keyframe in keyframes)
@@ -94,12 +94,12 @@ def test_ground_that_is_mapped_already_stores_no_keyframe():
     dialogue = Dialogue()
     forward = list(drive(41))
     for odometry, scan, _ in forward:
-        dialogue.tell(odometry, scan)
-    stored = sum(keyframe.estimates[0].stored for keyframe in dialogue.of(Keyframe))
+        dialogue.send(odometry, scan)
+    stored = sum(keyframe.estimates[0].stored for keyframe in dialogue.messages_of(Keyframe))
     for k, (odometry, scan, _) in enumerate(reversed(forward)):
         stamp = 10 * SECOND + k * SECOND // 10
-        dialogue.tell(replace(odometry, stamp=stamp), replace(scan, stamp=stamp))
-    keyframes = dialogue.of(Keyframe)
+        dialogue.send(replace(odometry, stamp=stamp), replace(scan, stamp=stamp))
+    keyframes = dialogue.messages_of(Keyframe)
     assert len(keyframes) > stored + 5
     assert sum(keyframe.estimates[0].stored for keyframe in keyframes) == stored
 
@@ -107,46 +107,46 @@ def test_ground_that_is_mapped_already_stores_no_keyframe():
 def test_scans_wait_while_a_keyframe_event_is_open_and_none_is_lost():
     dialogue = Dialogue(answer=lambda keyframe: [])
     for odometry, scan, _ in drive(20):
-        dialogue.tell(odometry, scan)
-    assert len(dialogue.of(LocalEstimate)) == 1
+        dialogue.send(odometry, scan)
+    assert len(dialogue.messages_of(LocalEstimate)) == 1
     assert dialogue.slam.queued_scans == 19
     dialogue.answer = agree
-    dialogue.tell(*agree(dialogue.of(Keyframe)[0]))
-    assert len(dialogue.of(LocalEstimate)) == 20
+    dialogue.send(*agree(dialogue.messages_of(Keyframe)[0]))
+    assert len(dialogue.messages_of(LocalEstimate)) == 20
 
 
 def test_a_scan_waits_for_its_odometry():
     dialogue = Dialogue()
     (odometry, scan, _), (later, _, _) = drive(2)
-    dialogue.tell(scan)
-    assert not dialogue.said
-    dialogue.tell(odometry, later)
-    assert len(dialogue.of(LocalEstimate)) == 1
+    dialogue.send(scan)
+    assert not dialogue.sent
+    dialogue.send(odometry, later)
+    assert len(dialogue.messages_of(LocalEstimate)) == 1
 
 
-def test_without_odometry_scans_are_matched_after_a_while_and_it_is_said_once():
+def test_without_odometry_scans_are_matched_after_a_while_and_it_is_reported_once():
     configuration = Configuration()
     configuration = replace(configuration, filter=replace(configuration.filter, max_scans_waiting_for_odometry=5))
     dialogue = Dialogue(configuration)
     for _, scan, _ in drive(30):
-        dialogue.tell(scan)
-    dialogue.tell(EndOfLog())
-    assert len(dialogue.of(LocalEstimate)) == 30
-    (notice,) = dialogue.of(Notice)
+        dialogue.send(scan)
+    dialogue.send(EndOfLog())
+    assert len(dialogue.messages_of(LocalEstimate)) == 30
+    (notice,) = dialogue.messages_of(Notice)
     assert "odometry" in notice.text
-    assert np.abs(dialogue.of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.1
+    assert np.abs(dialogue.messages_of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.1
 
 
-def test_stamps_that_jump_back_lose_no_scan_and_are_said_once():
+def test_stamps_that_jump_back_lose_no_scan_and_are_reported_once():
     dialogue = Dialogue()
     for k, (odometry, scan, _) in enumerate(drive(30)):
         stamp = scan.stamp - (SECOND // 2 if k in (10, 20) else 0)
-        dialogue.tell(replace(odometry, stamp=stamp), replace(scan, stamp=stamp))
-    dialogue.tell(EndOfLog())
-    assert len(dialogue.of(LocalEstimate)) == 30
-    (notice,) = dialogue.of(Notice)
+        dialogue.send(replace(odometry, stamp=stamp), replace(scan, stamp=stamp))
+    dialogue.send(EndOfLog())
+    assert len(dialogue.messages_of(LocalEstimate)) == 30
+    (notice,) = dialogue.messages_of(Notice)
     assert "not after its predecessor" in notice.text
-    assert np.abs(dialogue.of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.1
+    assert np.abs(dialogue.messages_of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.1
 
 
 @pytest.mark.parametrize("spoil", [np.nan, np.inf, 0.0, -1.0])
@@ -155,42 +155,42 @@ def test_faulty_ranges_and_differing_beam_counts_lose_no_scan(spoil):
     for k, (odometry, scan, _) in enumerate(drive(30)):
         ranges = scan.ranges.copy()
         ranges[k % 7 :: 7] = spoil
-        dialogue.tell(odometry, replace(scan, ranges=ranges[: len(ranges) - k % 3]))
-    dialogue.tell(EndOfLog())
-    assert dialogue.of(EndOfRun)[0].processed == 30
-    assert np.abs(dialogue.of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.05
+        dialogue.send(odometry, replace(scan, ranges=ranges[: len(ranges) - k % 3]))
+    dialogue.send(EndOfLog())
+    assert dialogue.messages_of(EndOfRun)[0].processed == 30
+    assert np.abs(dialogue.messages_of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.05
 
 
 def test_a_scan_without_any_return_is_placed_by_odometry():
     dialogue = Dialogue()
     for k, (odometry, scan, _) in enumerate(drive(30)):
         blind = replace(scan, ranges=np.full_like(scan.ranges, np.nan)) if k % 2 else scan
-        dialogue.tell(odometry, blind)
-    assert len(dialogue.of(LocalEstimate)) == 30
-    assert len(dialogue.of(Notice)) == 1
-    assert np.abs(dialogue.of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.05
+        dialogue.send(odometry, blind)
+    assert len(dialogue.messages_of(LocalEstimate)) == 30
+    assert len(dialogue.messages_of(Notice)) == 1
+    assert np.abs(dialogue.messages_of(LocalEstimate)[-1].pose.mean - (2.9, 0, 0)).max() < 0.05
 
 
 def test_the_trails_hold_every_scan_once_and_lead_to_its_pose():
     dialogue = Dialogue()
     truths = []
     for odometry, scan, pose in drive(60):
-        dialogue.tell(odometry, scan)
+        dialogue.send(odometry, scan)
         truths.append(pose)
-    dialogue.tell(EndOfLog())
+    dialogue.send(EndOfLog())
     poses = {0: np.zeros(3)}
-    for keyframe in dialogue.of(Keyframe):
+    for keyframe in dialogue.messages_of(Keyframe):
         poses[keyframe.sequence] = keyframe.estimates[0].pose.mean
         poses |= {r.keyframe: r.pose for r in keyframe.estimates[0].revised_keyframes}
     rows = [
         (trail.first_scan + k, se2.compose(poses[int(anchor)], pose))
-        for trail in dialogue.of(ScanPoses)
+        for trail in dialogue.messages_of(ScanPoses)
         for k, (anchor, pose) in enumerate(zip(trail.keyframes, trail.poses, strict=True))
     ]
     assert [scan for scan, _ in rows] == list(range(60))
     errors = np.array([se2.between(t, p) for t, (_, p) in zip(truths, rows, strict=True)])
     assert np.hypot(*errors[:, :2].T).max() < 0.05
-    (finished,) = dialogue.of(EndOfRun)
+    (finished,) = dialogue.messages_of(EndOfRun)
     assert (finished.received, finished.processed, finished.dropped) == (60, 60, 0)
 
 
@@ -200,12 +200,12 @@ def split_at(event):
     def answer(keyframe):
         if keyframe.sequence != event:
             return agree(keyframe)
-        (leaf,) = keyframe.estimates
+        (hypothesis,) = keyframe.estimates
         reference = PoseGaussian(np.array([3.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-5]))
         moved = tuple(MovedKeyframe(k, 0, 1, np.array([0.5 * (k - 6), 0.0, 0.0])) for k in range(6, event + 1))
         change = Hypothesis(
             1,
-            leaf.hypothesis,
+            hypothesis.hypothesis,
             1.0,
             1,
             reference.inverse(),
@@ -222,14 +222,14 @@ def test_after_a_change_of_area_poses_are_in_the_new_frame_and_tracking_goes_on(
     dialogue = Dialogue(answer=split_at(10))
     truths = []
     for odometry, scan, pose in drive(80):
-        dialogue.tell(odometry, scan)
+        dialogue.send(odometry, scan)
         truths.append(pose)
-    estimates = dialogue.of(LocalEstimate)
+    estimates = dialogue.messages_of(LocalEstimate)
     assert {estimate.area for estimate in estimates} == {0, 1}
     for truth, estimate in zip(truths, estimates, strict=True):
         origin = np.array([3.0 if estimate.area == 1 else 0.0, 0.0, 0.0])
         assert np.abs(se2.between(truth, se2.compose(origin, estimate.pose.mean))[:2]).max() < 0.06
-    last = dialogue.of(Keyframe)[-1].estimates[0]
+    last = dialogue.messages_of(Keyframe)[-1].estimates[0]
     assert last.hypothesis == 1
     assert last.area == 1
 
@@ -241,35 +241,35 @@ def test_a_robot_whose_area_becomes_part_of_another_goes_on_there():
     def answer(keyframe):
         if keyframe.sequence == 0 or keyframe.estimates[0].hypothesis == 0 or keyframe.sequence != 13:
             return split(keyframe)
-        leaf = Hypothesis(
+        hypothesis = Hypothesis(
             1, 1, 1.0, 0, back, local_areas=(LocalArea(0, np.zeros(3)),), area_merge=AreaMerge(1, 0, back)
         )
-        return [Hypotheses(13, (leaf,)), ClosureDecision(13, 1)]
+        return [Hypotheses(13, (hypothesis,)), ClosureDecision(13, 1)]
 
     dialogue = Dialogue(answer=answer)
     truths = []
     for odometry, scan, pose in drive(80):
-        dialogue.tell(odometry, scan)
+        dialogue.send(odometry, scan)
         truths.append(pose)
-    estimates = dialogue.of(LocalEstimate)
+    estimates = dialogue.messages_of(LocalEstimate)
     assert [area for area, _ in groupby(estimates, lambda estimate: estimate.area)] == [0, 1, 0]
     for truth, estimate in zip(truths, estimates, strict=True):
         origin = np.array([3.0 if estimate.area == 1 else 0.0, 0.0, 0.0])
         assert np.abs(se2.between(truth, se2.compose(origin, estimate.pose.mean))[:2]).max() < 0.06
     hybrid_map = dialogue.slam._replica.maps[1]
     assert hybrid_map.area_ids() == [0]
-    assert sorted(hybrid_map.keyframes(0)) == [keyframe.sequence for keyframe in dialogue.of(Keyframe)]
+    assert sorted(hybrid_map.keyframes(0)) == [keyframe.sequence for keyframe in dialogue.messages_of(Keyframe)]
     assert set(dialogue.slam._best_hypothesis.filter.keyframe_areas) == {0}
     # The drift goes on from what it was, with what is not known of how the two lie to each other.
-    before, after = (dialogue.of(Keyframe)[k].estimates[0].pose.covariance for k in (13, 14))
+    before, after = (dialogue.messages_of(Keyframe)[k].estimates[0].pose.covariance for k in (13, 14))
     assert np.trace(after[:2, :2]) > np.trace(before[:2, :2]) + 1e-4
 
 
 def test_the_drift_grows_from_the_origin_of_the_area():
     dialogue = Dialogue(answer=split_at(10))
     for odometry, scan, _ in drive(80):
-        dialogue.tell(odometry, scan)
-    deviations = [np.sqrt(np.trace(k.estimates[0].pose.covariance[:2, :2])) for k in dialogue.of(Keyframe)]
+        dialogue.send(odometry, scan)
+    deviations = [np.sqrt(np.trace(k.estimates[0].pose.covariance[:2, :2])) for k in dialogue.messages_of(Keyframe)]
     assert (np.diff(deviations[:11]) > 0).all()
     assert deviations[11] < deviations[10]
 
@@ -278,35 +278,43 @@ def test_two_hypotheses_are_tracked_side_by_side():
     def fork(keyframe):
         if keyframe.sequence != 3:
             return agree(keyframe)
-        leaves = (Hypothesis(1, 0, 0.5, 0), Hypothesis(2, 0, 0.5, 0))
-        return [Hypotheses(3, leaves), ClosureDecision(3)]
+        children = (Hypothesis(1, 0, 0.5, 0), Hypothesis(2, 0, 0.5, 0))
+        return [Hypotheses(3, children), ClosureDecision(3)]
 
     dialogue = Dialogue(answer=fork)
     for odometry, scan, _ in drive(40):
-        dialogue.tell(odometry, scan)
-    keyframes = dialogue.of(Keyframe)
-    assert [leaf.hypothesis for leaf in keyframes[-1].estimates] == [1, 2]
-    assert sorted({trail.hypothesis for trail in dialogue.of(ScanPoses)}) == [0, 1, 2]
-    dialogue.tell(ClosureDecision(keyframes[-1].sequence, 2))
+        dialogue.send(odometry, scan)
+    keyframes = dialogue.messages_of(Keyframe)
+    assert [hypothesis.hypothesis for hypothesis in keyframes[-1].estimates] == [1, 2]
+    assert sorted({trail.hypothesis for trail in dialogue.messages_of(ScanPoses)}) == [0, 1, 2]
+    dialogue.send(ClosureDecision(keyframes[-1].sequence, 2))
     for odometry, scan, _ in drive(10, start=40):
-        dialogue.tell(odometry, scan)
-    assert [leaf.hypothesis for leaf in dialogue.of(Keyframe)[-1].estimates] == [2]
+        dialogue.send(odometry, scan)
+    assert [hypothesis.hypothesis for hypothesis in dialogue.messages_of(Keyframe)[-1].estimates] == [2]
 
 
 def test_a_robot_that_takes_itself_for_lost_goes_on_by_odometry():
-    """It may be wrong about that, so that it is drawn where it is if nobody carried it."""
+    """The kidnapping may be a false alarm, so that the robot is drawn at its pose without it."""
 
     def lost_at_the_third(keyframe):
         lost = keyframe.sequence == 2
         answer, accepted = agree(keyframe)
-        leaves = tuple(replace(leaf, lost=lost, tracking_reset=lost) for leaf in answer.hypotheses)
-        return [replace(answer, hypotheses=leaves), accepted]
+        children = tuple(replace(hypothesis, lost=lost, tracking_reset=lost) for hypothesis in answer.hypotheses)
+        return [replace(answer, hypotheses=children), accepted]
 
     dialogue = Dialogue(answer=lost_at_the_third)
     truths = []
     for odometry, scan, pose in drive(40):
-        dialogue.tell(odometry, scan)
+        dialogue.send(odometry, scan)
         truths.append(pose)
-    assert [keyframe.motion_unknown for keyframe in dialogue.of(Keyframe)[:5]] == [False, False, False, True, False]
-    off = np.array([se2.between(t, e.pose.mean) for t, e in zip(truths, dialogue.of(LocalEstimate), strict=True)])
+    assert [keyframe.motion_unknown for keyframe in dialogue.messages_of(Keyframe)[:5]] == [
+        False,
+        False,
+        False,
+        True,
+        False,
+    ]
+    off = np.array(
+        [se2.between(t, e.pose.mean) for t, e in zip(truths, dialogue.messages_of(LocalEstimate), strict=True)]
+    )
     assert np.hypot(*off[:, :2].T).max() < 0.05

@@ -27,7 +27,7 @@ SCANS = 160
 
 
 def true_pose(seconds):
-    """``world_T_base`` (n, 3) on a round of straight metres and quarter circles, each of one second."""
+    """``world_T_base`` (n, 3) on a round of straight meters and quarter circles, each of one second."""
     corners = [np.zeros(3)]
     for second in range(SCANS // 10 + 1):
         corners.append(se2.compose(corners[-1], se2.exp(twist(second))))
@@ -64,7 +64,7 @@ class Drive(NamedTuple):
         return float(np.sqrt(np.mean(np.sum(self.errors[:, :2] ** 2, axis=1))))
 
 
-def driven(sweep, told):
+def drive_sweeping(sweep, reported):
     """A drive with a laser whose sweep takes so many seconds, and says so or not."""
     odometry, dialogue = list(readings()), Dialogue()
     for k in range(SCANS):
@@ -72,13 +72,13 @@ def driven(sweep, told):
         poses = true_pose(begin + sweep * np.linspace(0.0, 1.0, BEAMS))
         stamp = SECOND + round(begin * SECOND)
         scan = scan_in(WALLS, poses, stamp, BEAMS, 1.5 * np.pi, noise=0.01, seed=k, sweep=sweep)
-        dialogue.tell(scan if told else replace(scan, time_increment=0.0))
+        dialogue.send(scan if reported else replace(scan, time_increment=0.0))
         while odometry and odometry[0].stamp < stamp + PERIOD * SECOND:
-            dialogue.tell(odometry.pop(0))
-    dialogue.tell(EndOfLog())
-    assert not dialogue.of(Notice)
-    estimates = np.array([estimate.pose.mean for estimate in dialogue.of(LocalEstimate)])
-    stored = [(k.scan, k.estimates[0].pose.mean) for k in dialogue.of(Keyframe) if k.estimates[0].stored]
+            dialogue.send(odometry.pop(0))
+    dialogue.send(EndOfLog())
+    assert not dialogue.messages_of(Notice)
+    estimates = np.array([estimate.pose.mean for estimate in dialogue.messages_of(LocalEstimate)])
+    stored = [(k.scan, k.estimates[0].pose.mean) for k in dialogue.messages_of(Keyframe) if k.estimates[0].stored]
     image = occupancy_image([scan for scan, _ in stored], np.array([pose for _, pose in stored]), 0.05, 30.0)
     errors = se2.between(true_pose(np.arange(SCANS) * PERIOD), estimates)
     return Drive(errors, int(np.sum(image.pixels == OCCUPIED)))
@@ -86,7 +86,11 @@ def driven(sweep, told):
 
 @pytest.fixture(scope="module")
 def drives():
-    return {"standing": driven(0.0, told=True), "skewed": driven(0.1, told=False), "deskewed": driven(0.1, told=True)}
+    return {
+        "standing": drive_sweeping(0.0, reported=True),
+        "skewed": drive_sweeping(0.1, reported=False),
+        "deskewed": drive_sweeping(0.1, reported=True),
+    }
 
 
 def test_a_robot_that_turns_while_its_laser_sweeps_is_found_as_if_the_laser_took_no_time(drives):
@@ -109,28 +113,28 @@ def sweeping_scan(index):
 
 
 def test_a_scan_waits_until_odometry_covers_its_last_beam():
-    dialogue = Dialogue().tell(Odometry(SECOND, np.zeros(3)), sweeping_scan(0))
-    dialogue.tell(Odometry(SECOND + SECOND * 8 // 100, np.array([0.08, 0.0, 0.0])))
-    assert not dialogue.said
-    dialogue.tell(Odometry(SECOND + SECOND * 9 // 100, np.array([0.09, 0.0, 0.0])))
-    (keyframe,) = dialogue.of(Keyframe)
+    dialogue = Dialogue().send(Odometry(SECOND, np.zeros(3)), sweeping_scan(0))
+    dialogue.send(Odometry(SECOND + SECOND * 8 // 100, np.array([0.08, 0.0, 0.0])))
+    assert not dialogue.sent
+    dialogue.send(Odometry(SECOND + SECOND * 9 // 100, np.array([0.09, 0.0, 0.0])))
+    (keyframe,) = dialogue.messages_of(Keyframe)
     np.testing.assert_allclose(keyframe.scan.motion, (0.09, 0.0, 0.0), atol=1e-9)
 
 
 def test_at_the_end_of_a_log_the_last_sweep_goes_on_as_the_odometry_did():
-    dialogue = Dialogue().tell(Odometry(SECOND - SECOND // 10, np.array([-0.1, 0.0, 0.0])))
-    dialogue.tell(Odometry(SECOND, np.zeros(3)), sweeping_scan(0))
-    assert not dialogue.said
-    dialogue.tell(EndOfLog())
-    np.testing.assert_allclose(dialogue.of(Keyframe)[0].scan.motion, (0.09, 0.0, 0.0), atol=1e-9)
+    dialogue = Dialogue().send(Odometry(SECOND - SECOND // 10, np.array([-0.1, 0.0, 0.0])))
+    dialogue.send(Odometry(SECOND, np.zeros(3)), sweeping_scan(0))
+    assert not dialogue.sent
+    dialogue.send(EndOfLog())
+    np.testing.assert_allclose(dialogue.messages_of(Keyframe)[0].scan.motion, (0.09, 0.0, 0.0), atol=1e-9)
 
 
-def test_an_impossible_time_increment_is_said_once_and_no_scan_is_lost():
+def test_an_impossible_time_increment_is_reported_once_and_no_scan_is_lost():
     dialogue = Dialogue()
     for k in range(10):
         stamp = SECOND + k * SECOND // 10
-        dialogue.tell(Odometry(stamp, np.zeros(3)), replace(sweeping_scan(k), time_increment=np.nan))
-    assert len(dialogue.of(LocalEstimate)) == 10
-    (notice,) = dialogue.of(Notice)
+        dialogue.send(Odometry(stamp, np.zeros(3)), replace(sweeping_scan(k), time_increment=np.nan))
+    assert len(dialogue.messages_of(LocalEstimate)) == 10
+    (notice,) = dialogue.messages_of(Notice)
     assert "time_increment = nan s" in notice.text
-    assert all(keyframe.scan.time_increment == 0.0 for keyframe in dialogue.of(Keyframe))
+    assert all(keyframe.scan.time_increment == 0.0 for keyframe in dialogue.messages_of(Keyframe))

@@ -41,7 +41,7 @@ class Drive:
             self.live.filter.track(sighting, Prediction(step, step, step))
         return self.live.process_keyframe(sequence, sighting, after_reset=sequence == 0)
 
-    def along(self, poses):
+    def drive_along(self, poses):
         return [self.to(pose) for pose in poses]
 
 
@@ -50,14 +50,14 @@ def deviations(estimate):
 
 
 @pytest.fixture(scope="module")
-def driven():
+def drives():
     """There by 15 steps, and after a leap back once more over the same ground."""
     drive_ = Drive()
-    return drive_.along(THERE[1:]), drive_.along(AGAIN)
+    return drive_.drive_along(THERE[1:]), drive_.drive_along(AGAIN)
 
 
-def test_over_ground_that_is_mapped_a_bare_corridor_bounds_the_drift_across_alone(driven):
-    there, again = driven
+def test_over_ground_that_is_mapped_a_bare_corridor_bounds_the_drift_across_alone(drives):
+    there, again = drives
     assert all(estimate.stored for estimate in there)
     assert not any(estimate.stored for estimate in again)
     first, last = deviations(there[-1]), deviations(again[-1])
@@ -66,14 +66,14 @@ def test_over_ground_that_is_mapped_a_bare_corridor_bounds_the_drift_across_alon
     assert last[1] < 0.5 * 0.05 * np.sqrt(31)
 
 
-def test_where_the_map_is_as_far_off_as_its_keyframes_so_is_a_pose_in_it(driven):
-    there, again = driven
+def test_where_the_map_is_as_far_off_as_its_keyframes_so_is_a_pose_in_it(drives):
+    there, again = drives
     near, far = deviations(again[1]), deviations(again[-1])
     assert near[2] < far[2]
     assert far[2] == pytest.approx(deviations(there[-1])[2], rel=0.5)
 
 
-def entered(live, moved, rebase):
+def enter_area(live, moved, rebase):
     """After TSBI sent the robot into area 1, with some keyframes."""
     poses = dict(zip(live.filter.keyframes, live.filter.leading_keyframe_poses(), strict=True))
     relabelled = tuple(MovedKeyframe(k, 0, 1, se2.compose(rebase.mean, poses[k])) for k in moved)
@@ -82,16 +82,16 @@ def entered(live, moved, rebase):
 
 @pytest.mark.parametrize("sigma", [0.1, 0.3])
 def test_a_robot_that_enters_an_area_is_as_uncertain_in_it_as_the_newest_keyframe_that_came_over(sigma):
-    driven = Drive()
-    driven.along(THERE[1:])
-    live = driven.live
+    drives = Drive()
+    drives.drive_along(THERE[1:])
+    live = drives.live
     reference, newest = live.filter.leading_keyframe_poses()[[12, 15]]
     placed = se2.compose([1.0, 2.0, 0.5], se2.between(reference, newest))
     entry = PoseGaussian(placed, np.diag([sigma, sigma, 0.01]) ** 2)
     rebase = entry.compose(PoseGaussian(se2.inverse(newest), np.zeros((3, 3))))
-    leaf, poses = entered(live, (12, 13, 14, 15), rebase)
-    content = [PlacedKeyframe(k, 1, driven.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
-    live.change_area(leaf, content, ParticleFilters(live.filter.mapping))
+    hypothesis, poses = enter_area(live, (12, 13, 14, 15), rebase)
+    content = [PlacedKeyframe(k, 1, drives.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
+    live.change_area(hypothesis, content, ParticleFilters(live.filter.mapping))
     np.testing.assert_allclose(live.filter.pose, entry.mean, atol=1e-9)
     np.testing.assert_allclose(live.event.pose_covariance, entry.covariance, atol=1e-6)
     assert live.pose_belief().covariance[0, 0] >= 0.9 * sigma**2
@@ -99,11 +99,11 @@ def test_a_robot_that_enters_an_area_is_as_uncertain_in_it_as_the_newest_keyfram
 
 def test_a_robot_that_goes_back_into_an_area_is_as_far_off_as_the_map_there_and_along_it_as_the_arc():
     drive_ = Drive()
-    drive_.along(THERE[1:])
+    drive_.drive_along(THERE[1:])
     live, rebase = drive_.live, PoseGaussian(np.array([-1.0, 0.0, 0.0]), np.diag([0.4, 0.4, 0.0]) ** 2)
     before = live.event.pose_covariance
-    leaf, poses = entered(live, (), rebase)
+    hypothesis, poses = enter_area(live, (), rebase)
     content = [PlacedKeyframe(k, 1, drive_.scans[k], se2.compose(rebase.mean, poses[k])) for k in range(16)]
-    live.change_area(leaf, content, ParticleFilters(live.filter.mapping))
+    live.change_area(hypothesis, content, ParticleFilters(live.filter.mapping))
     assert live.event.pose_covariance[0, 0] == pytest.approx(before[0, 0] + 0.16, rel=0.2)
     assert live.event.pose_covariance[1, 1] < 0.05

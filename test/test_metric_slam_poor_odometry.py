@@ -29,27 +29,27 @@ def turning_drive(rate, seconds=24.0):
 
 def errors(dialogue, truths):
     """Largest distance, m, and angle, degrees, of any estimate from the truth."""
-    poses = np.array([estimate.pose.mean for estimate in dialogue.of(LocalEstimate)])
+    poses = np.array([estimate.pose.mean for estimate in dialogue.messages_of(LocalEstimate)])
     difference = se2.between(np.array(truths), poses)
     return np.hypot(*difference[:, :2].T).max(), np.degrees(np.abs(difference[:, 2])).max()
 
 
 @pytest.mark.parametrize("rate", [1.0, 5.0])
 @pytest.mark.parametrize("slip", [-40.0, 40.0])
-def test_a_slip_in_a_turn_does_not_lose_the_robot_and_is_said_once(rate, slip):
+def test_a_slip_in_a_turn_does_not_lose_the_robot_and_is_reported_once(rate, slip):
     dialogue, truths = Dialogue(), []
     odometry, before = np.zeros(3), np.zeros(3)
     for stamp, pose, scan in turning_drive(rate):
         slipped = np.radians(slip) * np.array([0.0, 0.0, 1.0 / rate]) * (7.0 < stamp / SECOND - 1.0 <= 8.0)
         odometry = se2.compose(odometry, se2.compose(se2.between(before, pose), slipped))
         before = pose
-        dialogue.tell(Odometry(stamp, odometry), scan)
+        dialogue.send(Odometry(stamp, odometry), scan)
         truths.append(pose)
-    dialogue.tell(EndOfLog())
+    dialogue.send(EndOfLog())
     distance, angle = errors(dialogue, truths)
     assert distance < 0.08
     assert angle < 1.5
-    (notice,) = (notice for notice in dialogue.of(Notice) if "the scans are believed" in notice.text)
+    (notice,) = (notice for notice in dialogue.messages_of(Notice) if "the scans are believed" in notice.text)
     by_odometry, by_scans = map(float, re.findall(r"turned by (-?\d+) degrees", notice.text))
     assert by_odometry - by_scans == pytest.approx(slip, abs=6.0)
     begin, end = map(float, re.search(r"from ([\d.]+) s to ([\d.]+) s", notice.text).groups())
@@ -60,21 +60,21 @@ def test_a_slip_in_a_turn_does_not_lose_the_robot_and_is_said_once(rate, slip):
 def test_without_odometry_the_robot_is_tracked_from_its_first_scan_on(rate):
     dialogue, truths = Dialogue(), []
     for _, pose, scan in turning_drive(rate):
-        dialogue.tell(scan)
+        dialogue.send(scan)
         truths.append(pose)
-    dialogue.tell(EndOfLog())
-    assert len(dialogue.of(LocalEstimate)) == len(truths)
+    dialogue.send(EndOfLog())
+    assert len(dialogue.messages_of(LocalEstimate)) == len(truths)
     distance, angle = errors(dialogue, truths)
     assert distance < 0.08
     assert angle < 1.5
-    (notice,) = dialogue.of(Notice)
+    (notice,) = dialogue.messages_of(Notice)
     assert "wait for odometry" in notice.text
 
 
 def test_without_odometry_no_scan_waits_once_patience_is_lost():
     dialogue = Dialogue()
     for k, (_, _, scan) in enumerate(turning_drive(5.0)):
-        dialogue.tell(scan)
+        dialogue.send(scan)
         waited = dialogue.slam.queued_scans
         assert waited == (k + 1 if k < 15 else 0)
 
@@ -83,29 +83,29 @@ def test_odometry_that_falls_silent_and_comes_back_is_used_again():
     dialogue, truths = Dialogue(), []
     for k, (stamp, pose, scan) in enumerate(turning_drive(5.0)):
         messages = [scan] if 30 <= k < 70 else [Odometry(stamp, pose), scan]
-        dialogue.tell(*messages)
+        dialogue.send(*messages)
         truths.append(pose)
-    dialogue.tell(EndOfLog())
+    dialogue.send(EndOfLog())
     distance, angle = errors(dialogue, truths)
     assert distance < 0.08
     assert angle < 1.5
-    assert len(dialogue.of(LocalEstimate)) == len(truths)
+    assert len(dialogue.messages_of(LocalEstimate)) == len(truths)
 
 
 def test_readings_that_are_missing_here_and_there_are_bridged():
     random = np.random.default_rng(0)
     dialogue, truths = Dialogue(), []
     for stamp, pose, scan in turning_drive(5.0):
-        dialogue.tell(*([scan] if random.random() < 0.3 else [Odometry(stamp, pose), scan]))
+        dialogue.send(*([scan] if random.random() < 0.3 else [Odometry(stamp, pose), scan]))
         truths.append(pose)
-    dialogue.tell(EndOfLog())
+    dialogue.send(EndOfLog())
     distance, angle = errors(dialogue, truths)
     assert distance < 0.08
     assert angle < 1.5
-    assert not dialogue.of(Notice)
+    assert not dialogue.messages_of(Notice)
 
 
-def test_noise_beyond_the_model_is_learnt_and_said_once():
+def test_noise_beyond_the_model_is_learnt_and_reported_once():
     random = np.random.default_rng(0)
     dialogue, truths = Dialogue(), []
     odometry, before = np.zeros(3), np.zeros(3)
@@ -113,13 +113,13 @@ def test_noise_beyond_the_model_is_learnt_and_said_once():
         error = np.array([0.08, 0.08, np.radians(4.0)]) * random.standard_normal(3)
         odometry = se2.compose(odometry, se2.compose(se2.between(before, pose), error))
         before = pose
-        dialogue.tell(Odometry(stamp, odometry), scan)
+        dialogue.send(Odometry(stamp, odometry), scan)
         truths.append(pose)
-    dialogue.tell(EndOfLog())
+    dialogue.send(EndOfLog())
     distance, angle = errors(dialogue, truths)
     assert distance < 0.1
     assert angle < 2.0
-    assert len([notice for notice in dialogue.of(Notice) if "noise model" in notice.text]) == 1
+    assert len([notice for notice in dialogue.messages_of(Notice) if "noise model" in notice.text]) == 1
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -128,8 +128,8 @@ def test_without_odometry_a_robot_that_sets_off_along_a_corridor_is_followed(see
     speeds = np.concatenate((np.zeros(15), np.arange(0.0, 0.6, 0.15), np.full(60, 0.6)))
     for k, x in enumerate(0.2 * np.cumsum(speeds)):
         truths.append(np.array([x, 0.0, 0.0]))
-        dialogue.tell(scan_in(walls, truths[-1], stamp=SECOND + k * SECOND // 5, noise=0.01, seed=k))
-    dialogue.tell(EndOfLog())
+        dialogue.send(scan_in(walls, truths[-1], stamp=SECOND + k * SECOND // 5, noise=0.01, seed=k))
+    dialogue.send(EndOfLog())
     distance, angle = errors(dialogue, truths)
     assert distance < 0.3
     assert angle < 1.5

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from misled import misled
+from make_misled import make_misled
 
 from hmt_slam_ros.cli import map_command
 from hmt_slam_ros.cli.arguments import build_parser
@@ -30,7 +30,7 @@ def contents(directory):
     return {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
 
 
-def written(directory, state):
+def write_folder(directory, state):
     """A folder with nothing but the state of a run."""
     writer = FolderWriter(directory)
     for name, part in state.parts.items():
@@ -59,7 +59,7 @@ def beginning(configuration, branching):
     return run
 
 
-def compared(log, folder, stops, branching=lambda: Branching, configuration=None):
+def compare_runs(log, folder, stops, branching=lambda: Branching, configuration=None):
     """Compare a run that stops after some records with one that does not.
 
     :param stops: (number of the record, state of TSBI) -> whether it is saved then, and another goes on.
@@ -75,8 +75,10 @@ def compared(log, folder, stops, branching=lambda: Branching, configuration=None
         if stops(number, run._processes["tsbi"].state):
             state = run.state
             stopped.append(state.processes["tsbi"])
-            run = LockStepRun(configuration, state=read(written(folder / str(number), state)))
-    assert contents(written(folder / "stopped", run.state)) == contents(written(folder / "whole", whole.state))
+            run = LockStepRun(configuration, state=read(write_folder(folder / str(number), state)))
+    assert contents(write_folder(folder / "stopped", run.state)) == contents(
+        write_folder(folder / "whole", whole.state)
+    )
     same_outcome(*(end.recorder.finish(end.log_progress.stamps) for end in (run.finish(), whole.finish())))
     return stopped
 
@@ -84,15 +86,15 @@ def compared(log, folder, stops, branching=lambda: Branching, configuration=None
 def test_a_run_that_forgot_keyframes_goes_on_without_them(tmp_path):
     known = [0]
 
-    def forgot(_, state):
+    def has_pruned(_, state):
         known.append(len(state.replica.scans))
         return known[-1] < known[-2] and len(state.hypothesis_states) == 1
 
     log = open_log("sim:office,size=0.7,rate=2.5,laps=3")
-    assert len(compared(log, tmp_path, forgot)) > 2
+    assert len(compare_runs(log, tmp_path, has_pruned)) > 2
 
 
-def once(*conditions):
+def stop_at(*conditions):
     """When to stop: when each of some conditions on TSBI's state holds for the first time."""
     open_ones = list(conditions)
 
@@ -106,27 +108,29 @@ def once(*conditions):
 
 def test_a_run_that_stops_again_and_again_ends_as_one_that_does_not(tmp_path):
     """Also where two hypotheses are alive, and between an odometry reading and its scan."""
-    several = once(lambda state: len(state.hypothesis_states) > 1)
-    stopped = compared(open_log(LOG), tmp_path, lambda number, state: number % 77 == 7 or several(number, state))
+    several = stop_at(lambda state: len(state.hypothesis_states) > 1)
+    stopped = compare_runs(open_log(LOG), tmp_path, lambda number, state: number % 77 == 7 or several(number, state))
     assert len(stopped) > 5
     assert max(len(state.hypothesis_states) for state in stopped) == 2
 
 
 def test_a_run_in_which_closures_were_accepted_and_areas_became_one_can_stop(tmp_path):
-    def closed(state):
+    def has_closure(state):
         return state.replica.common.closures.any()
 
-    def merged(state):
+    def has_merged(state):
         return len(state.replica.common.areas) <= state.replica.max_area_id
 
-    several = once(lambda state: len(state.hypothesis_states) > 1, closed, merged)
-    stopped = compared(open_log("sim:grid,seed=1,count=2", duration=110.0), tmp_path, several)
+    several = stop_at(lambda state: len(state.hypothesis_states) > 1, has_closure, has_merged)
+    stopped = compare_runs(open_log("sim:grid,seed=1,count=2", duration=110.0), tmp_path, several)
     assert len(stopped) == 3
 
 
-def test_a_run_in_which_a_closure_is_doubted_can_stop_before_the_question_is_answered(tmp_path):
+def test_a_run_in_which_a_closure_is_revised_can_stop_before_the_question_is_answered(tmp_path):
     log = open_log("sim:ring,seed=3,size=1.5", duration=165.0)
-    (stopped,) = compared(log, tmp_path, once(lambda state: state.revised_hypotheses), lambda: misled(2, 0, 3.8))
+    (stopped,) = compare_runs(
+        log, tmp_path, stop_at(lambda state: state.revised_hypotheses), lambda: make_misled(2, 0, 3.8)
+    )
     assert [ends.source for ends in stopped.revised_hypotheses[0].removed_arcs] == [0]
 
 
@@ -134,9 +138,9 @@ def test_a_run_in_which_a_closure_is_doubted_can_stop_before_the_question_is_ans
 def test_a_run_whose_local_maps_are_of_lines_can_stop(tmp_path, kind):
     """Also after the change into a second area."""
     configuration = with_changes(Configuration(), {"local_map.kind": kind})
-    second = once(lambda state: len(state.replica.common.areas) > 1)
+    second = stop_at(lambda state: len(state.replica.common.areas) > 1)
     log = open_log("sim:office,seed=3,size=0.7,rate=2.5", duration=80.0)
-    stopped = compared(
+    stopped = compare_runs(
         log, tmp_path, lambda number, state: number % 301 == 300 or second(number, state), configuration=configuration
     )
     assert len(stopped) > 2
@@ -146,7 +150,7 @@ def test_a_run_whose_local_maps_are_of_lines_can_stop(tmp_path, kind):
 def test_before_the_first_scan_and_after_the_last_a_run_can_stop_as_well(tmp_path):
     log = open_log(LOG, duration=3.0)
     last = sum(1 for _ in log.records()) - 1
-    assert len(compared(log, tmp_path, lambda number, _: number in (0, 1, last))) == 3
+    assert len(compare_runs(log, tmp_path, lambda number, _: number in (0, 1, last))) == 3
 
 
 def test_scans_without_odometry_wait_in_the_saved_map_as_well(tmp_path):
@@ -158,7 +162,7 @@ def test_scans_without_odometry_wait_in_the_saved_map_as_well(tmp_path):
         run.process_record(record)
     state = run.state
     assert len(state.processes["slam"].scan_queue.scans) == 3
-    run = LockStepRun(Configuration(), state=read(written(tmp_path / "waiting", state)))
+    run = LockStepRun(Configuration(), state=read(write_folder(tmp_path / "waiting", state)))
     for record in scans[3:]:
         whole.process_record(record)
         run.process_record(record)
@@ -166,14 +170,16 @@ def test_scans_without_odometry_wait_in_the_saved_map_as_well(tmp_path):
 
 
 def test_a_run_whose_areas_end_at_doors_goes_on_with_the_openings_that_it_saw(tmp_path):
-    several = once(lambda state: len(state.hypothesis_states) > 1)
+    several = stop_at(lambda state: len(state.hypothesis_states) > 1)
     configuration = with_changes(Configuration(), {"aam.area_policy": "both"})
     log = open_log("sim:office,size=0.7,rate=2.5,laps=1")
-    stopped = compared(log, tmp_path, lambda k, state: k % 150 == 149 or several(k, state), configuration=configuration)
+    stopped = compare_runs(
+        log, tmp_path, lambda k, state: k % 150 == 149 or several(k, state), configuration=configuration
+    )
     assert len(stopped) > 3
 
 
-def mapped(folder, *options):
+def run_map(folder, *options):
     command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(LOG), "--out", str(folder), *options]
     return subprocess.run(command, check=False, timeout=300, capture_output=True, text=True)
 
@@ -182,7 +188,7 @@ def mapped(folder, *options):
 def first(tmp_path_factory):
     """The map of the first seconds, with parameters of its own."""
     folder = tmp_path_factory.mktemp("maps") / "first"
-    done = mapped(folder, "--duration", "6", "--seed", "3", "--set", "aam.confirmations=3")
+    done = run_map(folder, "--duration", "6", "--seed", "3", "--set", "aam.confirmations=3")
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -193,7 +199,7 @@ def test_the_command_goes_on_with_the_parameters_of_the_map_which_it_may_replace
         "whole": ("--seed", "3", "--set", "aam.confirmations=3"),
         "on": ("--from", str(tmp_path / "on")),
     }.items():
-        done = mapped(tmp_path / folder, "--duration", "12", *options)
+        done = run_map(tmp_path / folder, "--duration", "12", *options)
         assert done.returncode == 0, done.stderr
     assert contents(tmp_path / "whole" / "hmt_map") == contents(tmp_path / "on" / "hmt_map")
     for name in ("trajectory.tum", "trajectory_online.tum", "pmf.csv", "map.pgm", "graph.g2o"):
@@ -225,17 +231,17 @@ def test_a_log_that_begins_alike_and_is_another_is_refused(first):
 
 def test_a_log_that_goes_on_begins_where_it_began_and_a_further_one_anywhere():
     saved = Configuration()
-    asked = with_changes(saved, {"robot.start": 2.0})
-    assert describe_parameter_changes(saved, asked, further=True) is None
+    requested = with_changes(saved, {"robot.start": 2.0})
+    assert describe_parameter_changes(saved, requested, further=True) is None
     with pytest.raises(HmtSlamError, match=r"made with robot\.start = 0\.0, not with robot\.start = 2\.0"):
-        describe_parameter_changes(saved, asked)
+        describe_parameter_changes(saved, requested)
 
 
-def test_parameters_that_may_change_are_told_with_both_values():
+def test_parameters_that_may_change_are_reported_with_both_values():
     saved = with_changes(Configuration(), {"tlca.accept_probability": 0.9, "robot.duration": 60.0})
     assert describe_parameter_changes(saved, with_changes(saved, {"robot.duration": 0.0})) is None
-    told = describe_parameter_changes(saved, with_changes(saved, {"tlca.accept_probability": 0.95, "seed": 4}))
-    assert told == (
+    reported = describe_parameter_changes(saved, with_changes(saved, {"tlca.accept_probability": 0.95, "seed": 4}))
+    assert reported == (
         "goes on with seed = 4 and tlca.accept_probability = 0.95; the map was made with seed = 0 and "
         "tlca.accept_probability = 0.9"
     )

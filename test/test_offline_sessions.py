@@ -54,7 +54,7 @@ def second_log():
     return open_log(WORLD, start=BEGIN, duration=SECOND)
 
 
-def extended(state, log):
+def extend_map(state, log):
     """The final map of a map and a further log, and how the logs were read."""
     result = run_log(log, Configuration(), state=state)
     recording = result.recorder.finish(result.log_progress.stamps, result.log_progress.first_scans)
@@ -63,7 +63,7 @@ def extended(state, log):
 
 @pytest.fixture(scope="module")
 def both(first, second_log):
-    return extended(first, second_log)
+    return extend_map(first, second_log)
 
 
 def test_the_poses_of_both_logs_are_in_one_frame(both, first):
@@ -82,7 +82,7 @@ def test_the_robot_was_lost_at_first_and_then_joined(first, second_log):
         run.process_record(record)
         events = max(run.recorder.hypotheses, default=-1)
         if events >= first.processes["slam"].keyframe_events:
-            lost.append(all(leaf.lost for leaf in run.recorder.hypotheses[events].hypotheses))
+            lost.append(all(hypothesis.lost for hypothesis in run.recorder.hypotheses[events].hypotheses))
     assert lost[0]
     assert not lost[-1]
     joined = lost.index(False)
@@ -92,7 +92,7 @@ def test_the_robot_was_lost_at_first_and_then_joined(first, second_log):
 @pytest.mark.parametrize("by", [-3600, -60])
 def test_stamps_before_and_among_those_of_the_map_make_no_difference(both, first, second_log, by):
     log = Restamped(second_log, by * 1_000_000_000)
-    recording, read = extended(first, log)
+    recording, read = extend_map(first, log)
     np.testing.assert_array_equal(recording.trajectory, both[0].trajectory)
     own = [record.source_stamp for record in scans_of(log)]
     np.testing.assert_array_equal(read.source_stamps[read.first_scans[-1] :], own)
@@ -104,15 +104,15 @@ def test_a_run_can_stop_in_the_second_log_as_well(both, first, second_log):
         run.process_record(record)
         if number == 1500:
             break
-    recording, log = extended(run.state, second_log)
+    recording, log = extend_map(run.state, second_log)
     np.testing.assert_array_equal(recording.trajectory, both[0].trajectory)
     assert log.first_scans == both[1].first_scans
 
 
 def test_a_log_that_the_map_does_not_know_is_an_island_in_it(first):
     """Neither bends the other."""
-    recording, log = extended(first, open_log(BUNDLED, duration=20.0))
-    alone, _ = extended(None, open_log(WORLD, duration=FIRST))
+    recording, log = extend_map(first, open_log(BUNDLED, duration=20.0))
+    alone, _ = extend_map(None, open_log(WORLD, duration=FIRST))
     apart = se2.between(alone.trajectory, recording.trajectory[: log.first_scans[1]])
     assert np.hypot(apart[:, 0], apart[:, 1]).max() < NEAR
     assert np.isfinite(recording.trajectory).all()
@@ -143,12 +143,12 @@ def hmt_slam(*words):
 
 def test_the_command_says_whether_the_log_is_a_further_one_and_writes_the_poses_of_all(tmp_path):
     hmt_slam("map", BUNDLED, "--out", tmp_path / "a", "--duration", 6, "--start", 0.5)
-    told = hmt_slam("map", BUNDLED, "--out", tmp_path / "b", "--duration", 9, "--from", tmp_path / "a").stderr
-    assert "malaga_one_loop is the log that the map was made of, of which " in told
-    assert "it is a further one" not in told
+    reported = hmt_slam("map", BUNDLED, "--out", tmp_path / "b", "--duration", 9, "--from", tmp_path / "a").stderr
+    assert "malaga_one_loop is the log that the map was made of, of which " in reported
+    assert "it is a further one" not in reported
     assert not (tmp_path / "b" / "earlier").exists()
-    told = hmt_slam("map", WORLD, "--out", tmp_path / "c", "--duration", 5, "--from", tmp_path / "b").stderr
-    assert "it is a further one" in told
+    reported = hmt_slam("map", WORLD, "--out", tmp_path / "c", "--duration", 5, "--from", tmp_path / "b").stderr
+    assert "it is a further one" in reported
     scans = [len(scans_of(log)) for log in (open_log(BUNDLED, start=0.5, duration=9.0), open_log(WORLD, duration=5.0))]
     for name in ("trajectory", "trajectory_online", "stages/keyframes"):
         assert read_tum(tmp_path / "c" / f"{name}.tum").stamps.size == scans[1]

@@ -1,4 +1,4 @@
-"""That kernels are being compiled is said where it is so, and only there."""
+"""That kernels are being compiled is reported where it is so, and only there."""
 
 import os
 import signal
@@ -13,12 +13,12 @@ for _ in range(2):
     report_compilation(print)
 {use}
 """
-"""It asks twice, as a node does that is taken down and brought up again."""
+"""It checks twice, as a node does that is taken down and brought up again."""
 LOAD = "import numpy as np; from hmt_slam_ros.grids.distance_field import has_bits"
 USE = "has_bits(np.zeros(3, np.uint32)); has_bits(np.zeros((1, 3), np.uint32)[0, ::2])"
 
 
-def said(cache, load=LOAD, use=USE):
+def messages(cache, load=LOAD, use=USE):
     finished = subprocess.run(
         [sys.executable, "-c", TELLING.format(load=load, use=use)],
         env=os.environ | {"NUMBA_CACHE_DIR": str(cache)},
@@ -31,24 +31,24 @@ def said(cache, load=LOAD, use=USE):
 
 
 def test_a_program_says_once_that_it_compiles_and_the_next_finds_everything_in_the_cache(tmp_path):
-    (sentence,) = said(tmp_path)
+    (sentence,) = messages(tmp_path)
     assert "compiling" in sentence
-    assert said(tmp_path) == []
+    assert messages(tmp_path) == []
 
 
 def test_a_disk_that_is_full_does_not_end_the_program(tmp_path):
     full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))"
-    compiling, kept = said(tmp_path, use=f"{full}; {USE}")
+    compiling, kept = messages(tmp_path, use=f"{full}; {USE}")
     assert "compiling" in compiling
     assert kept.startswith("compiled kernels cannot be kept in ")
     assert "File too large; each start compiles them anew" in kept
 
 
 def test_a_program_without_kernels_does_not_load_numba_for_this(tmp_path):
-    assert said(tmp_path, load="", use="print('numba' in sys.modules)") == ["False"]
+    assert messages(tmp_path, load="", use="print('numba' in sys.modules)") == ["False"]
 
 
-def told(*arguments, environment):
+def count_reports(*arguments, environment):
     """How often a command says that it compiles."""
     command = [sys.executable, "-m", "hmt_slam_ros.cli.main", *arguments]
     finished = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=300)
@@ -58,14 +58,14 @@ def told(*arguments, environment):
 def test_a_command_says_it_once_and_never_again(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     drive = ("simulate", "office", "--duration", "1", "--out")
-    assert [told(*drive, tmp_path / str(n), environment=environment) for n in range(2)] == [1, 0]
+    assert [count_reports(*drive, tmp_path / str(n), environment=environment) for n in range(2)] == [1, 0]
 
 
 def test_every_kernel_that_maps_a_log_is_in_the_cache_afterwards(tmp_path):
     log, lines = tmp_path / "short.clf", "FLASER 3 1.0 1.1 1.2 {x} 0 0 {x} 0 0 {t} robot {t}\n"
     log.write_text("".join(lines.format(x=0.2 * k, t=float(k)) for k in range(6)))
-    told("map", log, "--out", tmp_path / "out", environment=os.environ)
-    assert told("map", log, "--out", tmp_path / "out", environment=os.environ) == 0
+    count_reports("map", log, "--out", tmp_path / "out", environment=os.environ)
+    assert count_reports("map", log, "--out", tmp_path / "out", environment=os.environ) == 0
 
 
 def test_a_node_says_it_once_and_never_again(tmp_path, listener, start, monkeypatch):
@@ -78,9 +78,9 @@ def test_a_node_says_it_once_and_never_again(tmp_path, listener, start, monkeypa
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     log = corridor_bag(tmp_path)
     for times in (1, 0):
-        heard = listener.hear(String, DOCUMENTS[LocalEstimate], CHAIN)
+        received = listener.subscribe(String, DOCUMENTS[LocalEstimate], CHAIN)
         slam = start("slam")
         start("robot", log=log, robot__rate=0.0, robot__flow_control=False)
-        listener.until(lambda heard=heard: heard, seconds=120.0, alive=[slam])
+        listener.until(lambda received=received: received, seconds=120.0, alive=[slam])
         slam.send_signal(signal.SIGINT)
         assert slam.communicate(timeout=60.0)[1].count("compiling kernels") == times

@@ -1,4 +1,4 @@
-"""The package says the same thing about itself everywhere, and contains what it promises."""
+"""The metadata of the package agree everywhere, and it contains what they promise."""
 
 import ast
 import configparser
@@ -150,7 +150,7 @@ def test_every_third_party_import_is_a_declared_dependency(python_packages):
     assert imported - set(sys.stdlib_module_names) - {"hmt_slam_ros", "_typeshed"} <= ros | python_packages
 
 
-def test_pip_and_rosdep_ask_for_the_same_python_packages_but_for_numba_which_rosdep_cannot_give(python_packages):
+def test_pip_and_rosdep_request_the_same_python_packages_but_for_numba_which_rosdep_cannot_give(python_packages):
     keys = {str(element.text) for element in package_xml().findall("exec_depend")}
     rosdep = {key.removeprefix("python3-").removesuffix("-pip") for key in keys if key.startswith("python3-")}
     assert python_packages == rosdep | {"numba"}
@@ -229,5 +229,5 @@ def test_foxglove_shows_the_topics_the_nodes_publish():
     paths = [line["value"] for panel in panels.values() for line in panel.get("paths", ())]
     plotted = {path.split(".")[0] for path in (*paths, panels["Indicator!localized"]["path"])}
     assert plotted == {"/hmt/pmf", "/hmt/entropy", "/hmt/is_localized"}
-    told = {panels["DiagnosticSummary!nodes"]["topicToRender"], plan["publish"]["poseEstimateTopic"]}
-    assert plotted | set(plan["topics"]) | told <= topics_of_the_nodes()
+    reported = {panels["DiagnosticSummary!nodes"]["topicToRender"], plan["publish"]["poseEstimateTopic"]}
+    assert plotted | set(plan["topics"]) | reported <= topics_of_the_nodes()

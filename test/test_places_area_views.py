@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_floor import CONFIGURATION, mapped
+from small_floor import CONFIGURATION, make_map
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.landmarks.area_landmarks import GrowingArea
@@ -13,7 +13,7 @@ from hmt_slam_ros.places.area_views import AreaViewCache
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 
-def ahead(scan):
+def front_scan(scan):
     first = scan.angle_min + 180 * scan.angle_increment
     return replace(scan, ranges=scan.ranges[180:540], angle_min=first)
 
@@ -21,9 +21,9 @@ def ahead(scan):
 @pytest.fixture(scope="module")
 def area():
     """An area's keyframes, and their scans, every other one of which sees only what is ahead."""
-    hybrid_map, scans = mapped(crossing_driven=False)
+    hybrid_map, scans = make_map(crossing_driven=False)
     keyframes = dict(list(hybrid_map.keyframes(0).items())[:8])
-    return keyframes, {k: ahead(scans[k]) if k % 2 else scans[k] for k in keyframes}
+    return keyframes, {k: front_scan(scans[k]) if k % 2 else scans[k] for k in keyframes}
 
 
 @pytest.fixture
@@ -31,11 +31,11 @@ def looked_up(monkeypatch):
     """The scans that were looked up."""
     scans, sighting = [], GrowingArea.observe_keyframe
 
-    def noted(own, scan, pose):
+    def make_sighting(own, scan, pose):
         scans.append(scan)
         return sighting(own, scan, pose)
 
-    monkeypatch.setattr(GrowingArea, "observe_keyframe", noted)
+    monkeypatch.setattr(GrowingArea, "observe_keyframe", make_sighting)
     return scans
 
 
@@ -65,7 +65,7 @@ def test_an_area_that_grew_shows_what_it_would_if_it_were_looked_up_at_once(area
 
 
 def test_areas_are_looked_at_ahead_so_many_keyframes_at_a_time(looked_up):
-    hybrid_map, scans = mapped(crossing_driven=False)
+    hybrid_map, scans = make_map(crossing_driven=False)
     areas = [(area, hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()]
     own, counts, every = views(scans), [], sum(len(keyframes) for _, keyframes in areas)
     while len(counts) < 2 or counts[-1] > counts[-2]:
@@ -86,7 +86,7 @@ def test_what_an_area_shows_in_two_maps_is_kept_for_both(area, looked_up):
     assert len(looked_up) == 2 * len(keyframes)
 
 
-def test_where_keyframes_moved_or_were_taken_out_it_is_looked_up_anew(area, looked_up):
+def test_where_keyframes_moved_or_were_taken_out_it_is_looked_up_again(area, looked_up):
     keyframes, scans = area
     own = views(scans)
     own.area_view(0, keyframes)

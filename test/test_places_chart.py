@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from small_floor import AREAS, CONFIGURATION, charted
+from small_floor import AREAS, CONFIGURATION, make_chart
 from worlds import box, scan_at
 
 from hmt_slam_ros.geometry import se2
@@ -25,14 +25,14 @@ from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 @pytest.fixture(scope="module")
 def charts():
-    return charted()
+    return make_chart()
 
 
 def true_places(chart):
     return np.array([se2.compose(AREAS[node.area], node.pose) for node in chart.nodes])
 
 
-def at(chart, x, y=0.0):
+def node_near(chart, x, y=0.0):
     """The node there."""
     (found,) = np.flatnonzero(np.hypot(*(true_places(chart)[:, :2] - (x, y)).T) < 0.3)
     return int(found)
@@ -42,8 +42,14 @@ def test_doors_crossings_and_ends_are_nodes_each_once(charts):
     chart = charts[0]
     kinds = {DOOR: 2, CROSSING: 1, END: 3}
     assert {kind: sum(node.kind == kind for node in chart.nodes) for kind in kinds} == kinds
-    assert [chart.nodes[at(chart, x)].kind for x in (1.0, 5.0, 10.0, 16.0, 21.0)] == [END, DOOR, DOOR, CROSSING, END]
-    assert chart.nodes[at(chart, 16.0, 11.0)].kind == END
+    assert [chart.nodes[node_near(chart, x)].kind for x in (1.0, 5.0, 10.0, 16.0, 21.0)] == [
+        END,
+        DOOR,
+        DOOR,
+        CROSSING,
+        END,
+    ]
+    assert chart.nodes[node_near(chart, 16.0, 11.0)].kind == END
     # All look along one of the building's axes.
     headings = true_places(chart)[:, 2] - true_places(chart)[0, 2]
     assert np.abs(se2.wrap(headings)).max() < 0.02
@@ -52,7 +58,7 @@ def test_doors_crossings_and_ends_are_nodes_each_once(charts):
 
 def test_opposite_doors_are_one_node_with_an_opening_on_either_side(charts):
     chart = charts[0]
-    pair, single = chart.nodes[at(chart, 10.0)], chart.nodes[at(chart, 5.0)]
+    pair, single = chart.nodes[node_near(chart, 10.0)], chart.nodes[node_near(chart, 5.0)]
     directions = sorted(one.direction for one in pair.openings)
     assert directions[1] - directions[0] == 2
     assert len(single.openings) == 1
@@ -61,7 +67,7 @@ def test_opposite_doors_are_one_node_with_an_opening_on_either_side(charts):
 
 
 def test_the_mouth_of_a_hallway_leads_to_a_hallway_and_so_does_what_is_on_both_sides_of_it(charts):
-    crossing = charts[0].nodes[at(charts[0], 16.0)]
+    crossing = charts[0].nodes[node_near(charts[0], 16.0)]
     assert len(crossing.openings) == 3
     assert all(one.leads_to_hallway for one in crossing.openings)
 
@@ -70,8 +76,8 @@ def test_edges_are_as_long_as_the_ways_between_their_nodes_and_lead_both_ways(ch
     chart = charts[0]
     places = true_places(chart)
     ways = {(edge.start, edge.end): edge for edge in chart.edges}
-    wanted = [at(chart, x) for x in (1.0, 5.0, 10.0, 16.0, 21.0)]
-    pairs = set(itertools.pairwise(wanted)) | {(at(chart, 16.0), at(chart, 16.0, 11.0))}
+    wanted = [node_near(chart, x) for x in (1.0, 5.0, 10.0, 16.0, 21.0)]
+    pairs = set(itertools.pairwise(wanted)) | {(node_near(chart, 16.0), node_near(chart, 16.0, 11.0))}
     assert set(ways) == pairs | {(b, a) for a, b in pairs}
     for (a, b), edge in ways.items():
         assert edge.distance[0] == pytest.approx(math.dist(places[a, :2], places[b, :2]), abs=0.05)
@@ -83,7 +89,7 @@ def test_edges_are_as_long_as_the_ways_between_their_nodes_and_lead_both_ways(ch
 
 def test_a_node_shows_its_openings_to_the_side_on_which_they_are(charts):
     chart = charts[0]
-    node = at(chart, 5.0)
+    node = node_near(chart, 5.0)
     seen = chart.graph_nodes[node]
     axis = seen.north if chart.nodes[node].openings[0].direction in {EAST, WEST} else seen.east
     openings = axis.tracks >= OPENINGS
@@ -94,9 +100,9 @@ def test_a_node_shows_its_openings_to_the_side_on_which_they_are(charts):
 
 def test_a_hallway_that_leads_on_is_an_opening_of_its_crossing_to_both_sides(charts):
     chart = charts[0]
-    number = at(chart, 16.0)
+    number = node_near(chart, 16.0)
     (mouth,) = {
-        edge.start_direction for edge in chart.edges if (edge.start, edge.end) == (number, at(chart, 16.0, 11.0))
+        edge.start_direction for edge in chart.edges if (edge.start, edge.end) == (number, node_near(chart, 16.0, 11.0))
     }
     seen = chart.graph_nodes[number].east if mouth in {EAST, WEST} else chart.update[number].north
     for track in (OPENINGS + 1, OPENINGS + 3):
@@ -115,12 +121,12 @@ def test_landmarks_of_rooms_are_not_those_of_the_hallway(charts):
 
 
 def test_a_wide_opening_behind_which_one_sees_far_is_a_crossing_before_anyone_drove_there():
-    chart, *_ = charted(crossing_driven=False)
-    crossing = chart.nodes[at(chart, 16.0)]
+    chart, *_ = make_chart(crossing_driven=False)
+    crossing = chart.nodes[node_near(chart, 16.0)]
     assert crossing.kind == CROSSING
     assert len(crossing.openings) == 1
     # The way into it is not known.
-    leaving = {edge.start_direction for edge in chart.edges if edge.start == at(chart, 16.0)}
+    leaving = {edge.start_direction for edge in chart.edges if edge.start == node_near(chart, 16.0)}
     assert len(leaving) == 2
     assert crossing.openings[0].direction not in leaving
 
@@ -210,9 +216,9 @@ FREE = [(x, None) for x in (6.0, 6.5, 7.0, 7.5)]
     ids=["closed", "for a moment", "opened again", "seen free before it"],
 )
 def test_a_way_that_was_closed_is_none_until_it_is_seen_free_again(charts, again, there):
-    chart, *_ = charted(again=again)
+    chart, *_ = make_chart(again=again)
     ways = {(edge.start, edge.end) for edge in chart.edges}
-    closed = at(chart, 5.0), at(chart, 10.0)
+    closed = node_near(chart, 5.0), node_near(chart, 10.0)
     assert {closed, closed[::-1]} <= ways if there else not {closed, closed[::-1]} & ways
     # All others stay, and so do the nodes.
     assert len(ways) == len(charts[0].edges) - (0 if there else 2)
@@ -220,12 +226,12 @@ def test_a_way_that_was_closed_is_none_until_it_is_seen_free_again(charts, again
 
 
 def test_of_a_door_in_several_areas_that_counts_which_was_seen_most_often():
-    def known(area, y, confidence, seen):
+    def make_opening(area, y, confidence, seen):
         pose = PoseGaussian(np.array([0.0, y, 0.0]), np.eye(3))
         landmark = Landmark(OPENING, pose, 0.9, 0.05, Existence(confidence, detections=seen))
         return SideOpening(area, 0, landmark, pose, EAST, False, pose.mean[:2])
 
-    often, once = known(0, 0.0, 0.97, 20), known(1, 0.1, 0.99, 1)
+    often, once = make_opening(0, 0.0, 0.97, 20), make_opening(1, 0.1, 0.99, 1)
     place = _node_draft([once, often], np.zeros((2, 2)))
     assert place.openings == (often,)
     assert place.area == 0

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from small_floor import AREAS, BUILDING, CONFIGURATION, charted, seen_at, walls
+from small_floor import AREAS, BUILDING, CONFIGURATION, make_chart, seen_at, walls
 from worlds import scan_at
 
 from hmt_slam_ros.geometry import se2
@@ -20,7 +20,7 @@ from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covarian
 
 @pytest.fixture(scope="module")
 def chart():
-    return charted()[0]
+    return make_chart()[0]
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +149,7 @@ def test_a_door_that_someone_hid_is_noticed_by_the_turn_into_it(chart, graph, mo
 
 
 def without_sides(openings):
-    """Those that lead ahead alone, as if somebody stood before the others."""
+    """Those that lead ahead alone, as if people hid the others."""
     return Openings(*(field[np.abs(openings.poses[:, 2]) < 0.5] for field in openings))
 
 

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmark.belief_corridors import Corridors, drawn_building, random_corridors
-from benchmark.belief_world import drawn_of_present
+from benchmark.belief_world import Corridors, draw_building, draw_of_present, random_corridors
 from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
 from hmt_slam_ros.places.loop_detector import TwoPeakTracker, initial_loop_belief
 from hmt_slam_ros.places.observation import observation_model
@@ -22,7 +21,7 @@ ROUND = 6  # nodes of the loop
 
 def lap(random):
     """The edges of a straight hallway with many landmarks, all of which are extracted in every lap."""
-    ways = [way for way in random_corridors(random, 1, 3, 0.2).ways if way.start_direction == EAST][:ROUND]
+    ways = [way for way in random_corridors(random, 1, 3, 0.2).edges_one_way if way.start_direction == EAST][:ROUND]
     return [way._replace(landmarks=sure(way.landmarks)) for way in ways]
 
 
@@ -38,7 +37,7 @@ def mapped_twice(random, edges, turned=0, missed=0.0):
     nodes = [Node(1.0, empty_sequence(), empty_sequence())] * (2 * ROUND + 1)
     twice = []
     for k in range(2 * ROUND):
-        there = drawn_building(random, Corridors([], [edges[k % ROUND]])).ways[0]
+        there = draw_building(random, Corridors([], [edges[k % ROUND]])).edges_one_way[0]
         known = edges[k % ROUND].landmarks
         listed = there.landmarks._replace(
             variances=np.full((len(there.landmarks.tracks), 2), known.variances[0] if len(known.tracks) else 0.0),
@@ -55,14 +54,14 @@ def mapped_twice(random, edges, turned=0, missed=0.0):
     return build_place_graph(nodes, twice, PLACES)
 
 
-def driven(random, belief, detector, edges, start, count):
+def drive_round(random, belief, detector, edges, start, count):
     """Proposals of a robot that goes round in the loop."""
     for k in range(start, start + count):
         own = edges[k % ROUND]
         length = random.normal(own.distance[0], 0.05)
         belief = belief.predict_arrival(Travel(length, random.normal(0.0, 0.02), NOISE))
         ahead = edges[(k + 1) % ROUND].landmarks
-        seen = drawn_of_present(random, ahead, np.ones(len(ahead.tracks), bool), 0.0, MODEL)
+        seen = draw_of_present(random, ahead, np.ones(len(ahead.tracks), bool), 0.0, MODEL)
         belief = belief.update(ahead_only(seen), MODEL, 0.0, 0.01)
         yield detector.update(belief), belief
 
@@ -79,7 +78,7 @@ def test_a_loop_that_was_mapped_twice_is_proposed_with_the_places_that_are_one(t
         edges = lap(random)
         graph = mapped_twice(random, edges, turned, missed)
         belief = initial_loop_belief(graph, PLACES)
-        for loop, _ in driven(random, belief, TwoPeakTracker(), edges, 0, ROUND - 1):
+        for loop, _ in drive_round(random, belief, TwoPeakTracker(), edges, 0, ROUND - 1):
             if loop is not None:
                 found += 1
                 assert abs(loop.node - loop.other_node) == ROUND
@@ -93,7 +92,7 @@ def test_no_loop_is_proposed_where_there_is_none():
         random = np.random.default_rng(seed)
         corridors = random_corridors(random, 1, 2, 0.1)
         graph = build_place_graph(corridors.nodes, corridors.edges, PLACES)
-        building = drawn_building(random, corridors)
+        building = draw_building(random, corridors)
         truth = build_place_graph(building.nodes, building.edges, PLACES)
         state = int(random.choice(np.flatnonzero(graph.successors >= 0)))
         belief, detector = initial_loop_belief(graph, PLACES), TwoPeakTracker()
@@ -102,7 +101,7 @@ def test_no_loop_is_proposed_where_there_is_none():
             state = int(graph.successors[state])
             own = slice(*truth.expected_landmarks.starts[state : state + 2])
             there = LandmarkSequence(*(field[own] for field in truth.expected_landmarks.landmarks))
-            seen = drawn_of_present(random, there, np.ones(len(there.tracks), bool), 0.0, MODEL)
+            seen = draw_of_present(random, there, np.ones(len(there.tracks), bool), 0.0, MODEL)
             belief = belief.predict_arrival(travel).update(seen, MODEL, 0.0, 0.01)
             assert detector.update(belief) is None
 
@@ -144,7 +143,7 @@ def test_peaks_may_head_for_different_sides_but_have_to_move_alike_and_apart(hal
     assert proposals(hallway, stuck) == [None] * 5
 
 
-def test_a_belief_that_is_certain_and_one_of_many_peaks_begin_anew(hallway):
+def test_a_belief_that_is_certain_and_one_of_many_peaks_restart(hallway):
     pairs = [(state_of(k, EAST), state_of(k + 6, EAST)) for k in range(5)]
     detector = TwoPeakTracker()
     for k, pair in enumerate(pairs):

@@ -55,7 +55,7 @@ def driven_twice(again, walls=None):
     return hybrid_map, scans
 
 
-def along(turned):
+def hallway_poses(turned):
     """Poses along the hallway, from its one end to the other."""
     ahead = np.array([(x, -0.1, 0.0) for x in np.arange(1.0, 21.2, 0.5)])
     return ahead if not turned else np.stack((ahead[::-1, 0], ahead[:, 1], np.full(len(ahead), math.pi)), axis=1)
@@ -66,12 +66,12 @@ def map_loops(scans):
 
 
 @pytest.fixture(scope="module", params=[False, True])
-def twice(request):
-    return driven_twice(along(request.param))
+def two_drives(request):
+    return driven_twice(hallway_poses(request.param))
 
 
-def test_a_hallway_that_the_map_holds_twice_is_a_loop_as_it_truly_lies(twice):
-    hybrid_map, scans = twice
+def test_a_hallway_that_the_map_holds_twice_is_a_loop_as_it_truly_lies(two_drives):
+    hybrid_map, scans = two_drives
     loop = map_loops(scans).newest_loop(hybrid_map)
     assert loop is not None
     assert (loop.area, loop.first_area, loop.other_area in (0, 1)) == (3, 3, True)
@@ -82,20 +82,20 @@ def test_a_hallway_that_the_map_holds_twice_is_a_loop_as_it_truly_lies(twice):
 
 
 def test_another_hallway_is_none():
-    hybrid_map, scans = driven_twice(along(turned=False), other_hallway())
+    hybrid_map, scans = driven_twice(hallway_poses(turned=False), other_hallway())
     assert map_loops(scans).newest_loop(hybrid_map) is None
 
 
 def test_a_robot_that_was_in_all_areas_of_late_has_no_map_of_before():
-    hybrid_map, scans = driven_twice(along(turned=False))
+    hybrid_map, scans = driven_twice(hallway_poses(turned=False))
     newest = max(scans)
     hybrid_map.set_keyframe(newest, 0, hybrid_map.keyframes(0)[0])
     hybrid_map.set_keyframe(newest, 2, hybrid_map.keyframes(2)[min(hybrid_map.keyframes(2))])
     assert map_loops(scans).newest_loop(hybrid_map) is None
 
 
-def test_the_way_leads_from_node_to_node_as_the_robot_went(twice):
-    hybrid_map, scans = twice
+def test_the_way_leads_from_node_to_node_as_the_robot_went(two_drives):
+    hybrid_map, scans = two_drives
     part = hybrid_map.subgraph([3])
     chart = build_chart(
         part, AreaViewCache(LocalMapping(CONFIGURATION), scans).views_of_map(part), CONFIGURATION.features
@@ -110,8 +110,8 @@ def test_the_way_leads_from_node_to_node_as_the_robot_went(twice):
     assert there[-1] == pytest.approx(se2.compose(THIRD, newest)[0], abs=1.0)
 
 
-def test_what_is_proposed_is_supposed_and_told_once_and_stays_no_arc(twice):
-    hybrid_map, scans = twice
+def test_a_proposal_is_used_and_reported_once_and_stays_no_arc(two_drives):
+    hybrid_map, scans = two_drives
     proposals = LoopProposer(CONFIGURATION, AreaViewCache(LocalMapping(CONFIGURATION), scans))
     supposed = proposals.with_proposed_arc(hybrid_map, 3)
     (notice,) = proposals.notices()
@@ -122,8 +122,8 @@ def test_what_is_proposed_is_supposed_and_told_once_and_stays_no_arc(twice):
     assert not proposals.notices()
 
 
-def test_where_an_arc_joins_the_two_nothing_is_proposed(twice):
-    hybrid_map, scans = twice
+def test_where_an_arc_joins_the_two_nothing_is_proposed(two_drives):
+    hybrid_map, scans = two_drives
     closed = hybrid_map.branch()
     for known in (0, 1):
         closed.set_arc(3, known, PoseGaussian(se2.between(THIRD, AREAS[known]), 0.01 * np.eye(3)), closure=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from worlds import scan_at
 
-from benchmark.belief_world import drawn_anywhere, drawn_observation
+from benchmark.belief_world import draw_clutter, draw_observation
 from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
 from hmt_slam_ros.landmarks.beam_labels import rays_from_scan
 from hmt_slam_ros.landmarks.corners import Corners, extract_corners
@@ -211,7 +211,7 @@ def mean_ratio(expected, model, draws=12000, variance=0.0, seed=1):
     ratios = np.exp(
         [
             log_observation_ratios(
-                drawn_anywhere(random, model.new_density, model.false_density, model), state, 0.0, variance, model
+                draw_clutter(random, model.new_density, model.false_density, model), state, 0.0, variance, model
             )[0]
             for _ in range(draws)
         ]
@@ -246,7 +246,7 @@ def test_unknown_ground_is_a_density_too():
     model = DENSE._replace(usual_density=0.25)
     ratios = np.exp(
         [
-            log_unknown_ground_ratio(drawn_anywhere(random, model.new_density, model.false_density, model), model)
+            log_unknown_ground_ratio(draw_clutter(random, model.new_density, model.false_density, model), model)
             for _ in range(8000)
         ]
     )
@@ -272,12 +272,12 @@ def test_what_is_seen_of_a_state_speaks_for_it_on_average_as_much_as_information
     )
     ratios = []
     for _ in range(8000):
-        seen = log_observation_ratios(drawn_observation(random, right, 0.0, 0.0, DENSE), both, 0.0, 0.0, DENSE)
+        seen = log_observation_ratios(draw_observation(random, right, 0.0, 0.0, DENSE), both, 0.0, 0.0, DENSE)
         ratios.append(math.exp(seen[1] - seen[0]))
     assert np.mean(ratios) == pytest.approx(1.0, abs=4.0 * np.std(ratios) / math.sqrt(len(ratios)))
 
 
-def test_without_landmarks_nothing_is_told_and_what_is_certain_and_missed_excludes():
+def test_without_landmarks_there_is_no_evidence_and_a_certain_missing_one_excludes():
     assert log_observation_ratios(empty_sequence(), one_state(empty_sequence()), 0.0, 0.0, MODEL)[0] == 0.0
     certain = landmarks((0, 0.0, 0.5, 0, 0, 1.0))
     found = log_observation_ratios(empty_sequence(), one_state(certain), 0.0, 0.0, MODEL._replace(detection=1.0))

@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmark.belief_corridors import random_corridors
-from benchmark.belief_world import drawn_anywhere, drawn_observation
+from benchmark.belief_world import draw_clutter, draw_observation, random_corridors
 from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
 from hmt_slam_ros.places.observation import log_observation_ratios, log_unknown_ground_ratio, observation_model
 from hmt_slam_ros.places.observation_graph import LandmarkSequence, empty_sequence, merge_sequences
@@ -46,9 +45,12 @@ def random_graph(seed, rows=1, columns=1, density=0.1):
 def test_the_next_opening_is_at_the_end_of_the_edge_or_behind_those_that_are_missed():
     graph = chain([3.0, 4.0, 5.0])
     own = graph.transitions.sources == state_of(0, EAST)
-    seen = 0.5 * PLACES.noticed
+    expected_tracks = 0.5 * PLACES.noticed
     assert list(graph.transitions.targets[own]) == [state_of(k, EAST) for k in (1, 2, 3)]
-    np.testing.assert_allclose(graph.transitions.probabilities[own], [seen, (1 - seen) * seen, (1 - seen) ** 2])
+    np.testing.assert_allclose(
+        graph.transitions.probabilities[own],
+        [expected_tracks, (1 - expected_tracks) * expected_tracks, (1 - expected_tracks) ** 2],
+    )
     np.testing.assert_allclose(graph.transitions.means[own], [(3, 0), (7, 0), (12, 0)])
     np.testing.assert_allclose(graph.transitions.variances[own, 0], [0.04, 0.08, 0.12])
     assert graph.successors[state_of(3, WEST)] == state_of(2, WEST)
@@ -58,17 +60,17 @@ def test_the_next_opening_is_at_the_end_of_the_edge_or_behind_those_that_are_mis
 def test_a_state_sees_ahead_and_back_what_the_map_has_there():
     graph = chain([3.0, 4.0, 5.0], places=dataclasses.replace(PLACES, reach=6.0))
 
-    def seen(state):
+    def expected_tracks(state):
         own = slice(*graph.expected_landmarks.starts[state : state + 2])
         return graph.expected_landmarks.landmarks.tracks[own], graph.expected_landmarks.landmarks.positions[own]
 
-    tracks, along = seen(state_of(1, EAST))
+    tracks, along = expected_tracks(state_of(1, EAST))
     np.testing.assert_allclose(along, [-2.0, 1.1, 5.2])
     assert not tracks.any()
-    tracks, along = seen(state_of(1, WEST))
+    tracks, along = expected_tracks(state_of(1, WEST))
     np.testing.assert_allclose(along, [-5.2, -1.1, 2.0])
     assert (tracks == 1).all()
-    assert not len(seen(state_of(1, NORTH))[0])
+    assert not len(expected_tracks(state_of(1, NORTH))[0])
 
 
 def test_behind_a_bend_nothing_is_in_sight():
@@ -87,7 +89,7 @@ def test_two_ways_in_one_direction_are_refused():
 
 
 def transition(graph, places, action):
-    """T(s, a, s') times the density of what was travelled, by the book, shape (states + 1, states + 1)."""
+    """T(s, a, s') times the density of what was traveled, by the book, shape (states + 1, states + 1)."""
     n = graph.state_count
     if not isinstance(action, Travel):
         quarters = action
@@ -128,7 +130,7 @@ def test_the_belief_is_that_of_an_enumeration_of_all_paths(seed):
         action = random.choice(4)
         action = Travel(*random.normal((3.0, 0.0), (0.5, 0.1)), (0.01, 0.01)) if action in (0, 1) else int(action - 2)
         away, variance = random.uniform(0.0, 1.0), 0.02
-        graph_seen = drawn_anywhere(random, 0.1, 0.1, MODEL)
+        graph_seen = draw_clutter(random, 0.1, 0.1, MODEL)
         if isinstance(action, Travel):
             belief = belief.predict_arrival(action)
         elif action:
@@ -136,11 +138,11 @@ def test_the_belief_is_that_of_an_enumeration_of_all_paths(seed):
         else:
             belief = belief.predict_travel(places.spacing)
         belief = belief.update(graph_seen, MODEL, away, variance)
-        told = np.append(
+        reported = np.append(
             log_observation_ratios(graph_seen, graph.expected_landmarks, away, variance, MODEL),
             log_unknown_ground_ratio(graph_seen, MODEL),
         )
-        factors.append(transition(graph, places, action) * np.exp(told))
+        factors.append(transition(graph, places, action) * np.exp(reported))
     start = np.exp(uniform_belief(graph, places).log_probabilities)
     ends = np.zeros(graph.state_count + 1)
     for path in itertools.product(range(graph.state_count + 1), repeat=3):
@@ -216,14 +218,14 @@ def test_where_the_map_ends_unknown_ground_begins():
     assert there.probabilities[-1] > 0.98
 
 
-def test_the_travelled_distance_tells_openings_apart():
+def test_the_traveled_distance_separates_openings():
     graph = chain([3.0, 4.0])
     start = certain_belief(graph, PLACES, state_of(0, EAST))
     assert start.predict_arrival(Travel(3.1, 0.0, (0.01, 0.01))).most_likely_state == state_of(1, EAST)
     assert start.predict_arrival(Travel(6.9, 0.0, (0.01, 0.01))).most_likely_state == state_of(2, EAST)
 
 
-def simulated(seed, places, steps=6):
+def simulate_beliefs(seed, places, steps=6):
     """Beliefs and true states of a robot that moves and sees exactly as the model says."""
     random = np.random.default_rng(seed)
     graph = random_graph(seed % 7, density=0.02)
@@ -261,9 +263,9 @@ def drawn_transition(random, graph, places, state, action):
 
 def drawn_seen(random, graph, state):
     if state == graph.state_count:
-        return drawn_anywhere(random, MODEL.usual_density, MODEL.false_density, MODEL)
+        return draw_clutter(random, MODEL.usual_density, MODEL.false_density, MODEL)
     own = slice(*graph.expected_landmarks.starts[state : state + 2])
-    return drawn_observation(
+    return draw_observation(
         random, LandmarkSequence(*(f[own] for f in graph.expected_landmarks.landmarks)), 0.0, 0.01, MODEL
     )
 
@@ -272,7 +274,7 @@ def test_beliefs_about_robots_of_the_model_are_calibrated():
     places = dataclasses.replace(PLACES, slip=0.05, discovery=0.2, unmapped=0.2)
     peaks, right = [], []
     for seed in range(250):
-        for belief, state in simulated(seed, places):
+        for belief, state in simulate_beliefs(seed, places):
             peaks.append(belief.probabilities.max())
             right.append(int(np.argmax(belief.log_probabilities)) == state)
     peaks, right = np.array(peaks), np.array(right)

@@ -1,11 +1,11 @@
-"""What landmarks say of places where a robot may be that woke up in a map."""
+"""Evidence of landmarks for the place of a robot that starts lost in a map."""
 
 import math
 
 import numpy as np
 import pytest
 
-from benchmark.landmark_scans import keyframes_of
+from benchmark.heading import keyframes_of
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -27,7 +27,7 @@ def place_prior(scans):
     return RelocalizationPrior(CONFIGURATION, AreaViewCache(LocalMapping(CONFIGURATION), scans))
 
 
-def located(pose, area=0):
+def make_candidate(pose, area=0):
     belief = PoseGaussian(np.asarray(pose, dtype=float), np.eye(3) * 1e-4)
     return PoseCandidate(area, MatchMode(belief, belief, 0.0), Agreement(0, 0, 0))
 
@@ -56,13 +56,13 @@ def test_landmarks_speak_for_the_right_place_and_against_others(drive):
     along = [se2.compose(true, np.array([shift, 0.0, 0.0])) for shift in (-2.0, 2.0, 5.0)]
     turned = se2.compose(true, np.array([0.0, 0.0, math.pi]))
     right, *others = place_prior(scans).log_ratios(
-        hybrid_map, seen, before, [located(pose) for pose in (true, *along, turned)]
+        hybrid_map, seen, before, [make_candidate(pose) for pose in (true, *along, turned)]
     )
     assert right > 1.0
     assert max(others) < right - 5.0
-    # A place a few centimetres off is the same one.
+    # A place a few centimeters off is the same one.
     (near,) = place_prior(scans).log_ratios(
-        hybrid_map, seen, before, [located(se2.compose(true, np.array([0.05, 0.05, 0.01])))]
+        hybrid_map, seen, before, [make_candidate(se2.compose(true, np.array([0.05, 0.05, 0.01])))]
     )
     assert abs(near - right) < 3.0
 
@@ -70,7 +70,7 @@ def test_landmarks_speak_for_the_right_place_and_against_others(drive):
 def test_what_speaks_against_places_weighs_them_with_an_exponent(drive):
     hybrid_map, scans, seen, before, true = drive
     prior = place_prior(scans)
-    found = (located(true), located(se2.compose(true, np.array([2.0, 0.0, 0.0]))), located(true))
+    found = (make_candidate(true), make_candidate(se2.compose(true, np.array([2.0, 0.0, 0.0]))), make_candidate(true))
     where = PoseDistribution(found, np.array([0.4, 0.4, 5e-4]))
     ratios = prior.log_ratios(hybrid_map, seen, before, found)
     expected = np.array([0.4, 0.4, 5e-4]) * np.exp([0.0, 0.5 * ratios[1], 0.0])
@@ -83,10 +83,12 @@ def test_what_speaks_against_places_weighs_them_with_an_exponent(drive):
 
 def test_a_look_finds_the_landmarks_gathered_at_the_events_before(drive, monkeypatch):
     hybrid_map, scans, seen, before, true = drive
-    prior, found = place_prior(scans), (located(se2.compose(true, np.array([2.0, 0.0, 0.0]))),)
+    prior, found = place_prior(scans), (make_candidate(se2.compose(true, np.array([2.0, 0.0, 0.0]))),)
     where, sighting = PoseDistribution(found, np.array([0.8])), GrowingArea.observe_keyframe
     looked_at = []
-    monkeypatch.setattr(GrowingArea, "observe_keyframe", lambda *asked: looked_at.append(asked) or sighting(*asked))
+    monkeypatch.setattr(
+        GrowingArea, "observe_keyframe", lambda *requested: looked_at.append(requested) or sighting(*requested)
+    )
     steps = CONFIGURATION.tsbi.recheck_keyframes - 1
     for _ in range(steps):
         known = len(looked_at)
@@ -98,18 +100,18 @@ def test_a_look_finds_the_landmarks_gathered_at_the_events_before(drive, monkeyp
     assert len(looked_at) == before + len(seen)
 
 
-def test_where_keyframes_of_the_map_moved_it_is_looked_at_anew(drive):
+def test_where_keyframes_of_the_map_moved_it_is_evaluated_again(drive):
     hybrid_map, scans, seen, before, true = drive
     prior = place_prior(scans)
-    place = [located(true)]
-    (asked,) = prior.log_ratios(hybrid_map, seen, before, place)
+    place = [make_candidate(true)]
+    (requested,) = prior.log_ratios(hybrid_map, seen, before, place)
     moved, shift = hybrid_map.branch(), np.array([3.0, -2.0, 0.0])
     for k, pose in hybrid_map.keyframes(0).items():
         moved.set_keyframe(k, 0, se2.compose(shift, pose))
     (off,) = prior.log_ratios(moved, seen, before, place)
-    (there,) = prior.log_ratios(moved, seen, before, [located(se2.compose(shift, true))])
-    assert there == pytest.approx(asked, abs=1.0)
-    assert off < asked - 3.0
+    (there,) = prior.log_ratios(moved, seen, before, [make_candidate(se2.compose(shift, true))])
+    assert there == pytest.approx(requested, abs=1.0)
+    assert off < requested - 3.0
 
 
 def test_new_ground_looks_like_the_places_of_the_map(drive):
@@ -118,7 +120,7 @@ def test_new_ground_looks_like_the_places_of_the_map(drive):
     for k in (0, 1):
         only.set_keyframe(k, 0, hybrid_map.keyframes(0)[k])
     newest = seen[max(seen)]
-    same = [located(se2.compose(pose, se2.inverse(newest))) for pose in only.keyframes(0).values()]
+    same = [make_candidate(se2.compose(pose, se2.inverse(newest))) for pose in only.keyframes(0).values()]
     ratios = place_prior(scans).log_ratios(only, seen, before, same)
     # All that is known of it are these two, of which it is one or the other with a probability of 0.9.
     assert np.exp(ratios).mean() < 1.0 / 0.9
@@ -133,7 +135,9 @@ def test_without_a_landmark_or_a_place_nothing_changes(drive):
 
 
 def test_weights_follow_bayes_and_stay_finite():
-    where = PoseDistribution((located(np.zeros(3)), located(np.ones(3))), np.array([0.3, 1.0 - UNMAPPED_PRIOR - 0.3]))
+    where = PoseDistribution(
+        (make_candidate(np.zeros(3)), make_candidate(np.ones(3))), np.array([0.3, 1.0 - UNMAPPED_PRIOR - 0.3])
+    )
     np.testing.assert_allclose(where.reweight([0.0, 0.0]).probabilities, where.probabilities)
     weighed = where.reweight([math.log(4.0), 0.0]).probabilities
     np.testing.assert_allclose(weighed, np.array([1.2, 0.5]) / 1.9)

@@ -94,8 +94,8 @@ def examine_without_it():
 
     others = tuple(name for name in process_names() if name != NAME)
     topics = defaultdict(lambda: Topic(1, ("driver",)))
-    told = [finding.text for finding in findings(RunningSystem(1.0, topics, others, (), (), {}, {}, ""))]
-    assert any(f"Of the nodes, {NAME} is missing" in text for text in told), told
+    reported = [finding.text for finding in findings(RunningSystem(1.0, topics, others, (), (), {}, {}, ""))]
+    assert any(f"Of the nodes, {NAME} is missing" in text for text in reported), reported
 
 
 def test_the_doctor_misses_it(with_row):
@@ -111,8 +111,8 @@ def test_the_page_expects_it(with_row, start):
     while "the page is at" not in page.stderr.readline():
         assert page.poll() is None
     with urlopen(f"http://127.0.0.1:{port}/news", timeout=10) as stream:
-        news = json.loads(next(line for line in stream if line.startswith(b"data: ")).removeprefix(b"data: "))
-    assert NAME in {row["name"] for row in news["nodes"]}
+        changes = json.loads(next(line for line in stream if line.startswith(b"data: ")).removeprefix(b"data: "))
+    assert NAME in {row["name"] for row in changes["nodes"]}
 
 
 def test_a_node_of_it_answers_and_saves_its_part(with_row, listener, start, tmp_path):
@@ -122,8 +122,8 @@ def test_a_node_of_it_answers_and_saves_its_part(with_row, listener, start, tmp_
     from hmt_slam_ros.messages.messages import ClosureDecision, Notice  # noqa: PLC0415
     from hmt_slam_ros.ros import topics  # noqa: PLC0415
 
-    notices = listener.hear(String, topic_of("Notice"), topics.CHAIN)
-    answers = listener.hear(String, topic_of("SaveResponse"), topics.CHAIN)
+    notices = listener.subscribe(String, topic_of("Notice"), topics.CHAIN)
+    answers = listener.subscribe(String, topic_of("SaveResponse"), topics.CHAIN)
     decisions = listener.node.create_publisher(String, topic_of("ClosureDecision"), topics.CHAIN)
     requests = listener.node.create_publisher(String, topic_of("SaveRequest"), topics.CHAIN)
     start(NAME)

@@ -1,4 +1,4 @@
-"""Real-time localisation: dead reckoning since the last estimate, in the area and in the map."""
+"""Real-time localization: dead reckoning since the last estimate, in the area and in the map."""
 
 import math
 
@@ -27,7 +27,7 @@ def estimate(seconds, pose, odom, area=0, variance=1e-4):
     return LocalEstimate(round(seconds * SECOND), 0, area, belief, np.array(odom, dtype=np.float64), 0)
 
 
-def accepted(**areas):
+def make_decision(**areas):
     poses = tuple(
         AreaPose(int(name[1:]), PoseGaussian(np.array(pose, dtype=np.float64), np.eye(3) * 0.01))
         for name, pose in areas.items()
@@ -40,44 +40,44 @@ def rtl():
     return Rtl(Configuration())
 
 
-def test_nothing_is_said_before_the_first_estimate(rtl):
+def test_nothing_is_sent_before_the_first_estimate(rtl):
     assert rtl.handle(odometry(0.0, 0, 0, 0)) == []
 
 
-def test_each_odometry_reading_is_answered_with_the_estimate_carried_on(rtl):
+def test_each_odometry_reading_is_answered_with_the_estimate_extrapolated(rtl):
     rtl.handle(odometry(0.0, 5, 5, math.pi / 2))
     assert rtl.handle(estimate(0.0, (1, 2, 0), (5, 5, math.pi / 2))) == []
-    (said,) = rtl.handle(odometry(0.1, 5, 5.3, math.pi / 2))
-    assert said.stamp == SECOND // 10
-    assert said.area == 0
-    assert np.allclose(said.pose_in_area.mean, (1.3, 2, 0))
+    (messages,) = rtl.handle(odometry(0.1, 5, 5.3, math.pi / 2))
+    assert messages.stamp == SECOND // 10
+    assert messages.area == 0
+    assert np.allclose(messages.pose_in_area.mean, (1.3, 2, 0))
 
 
 def test_the_odometry_that_came_while_metric_slam_was_busy_counts(rtl):
     for k in range(11):
         rtl.handle(odometry(0.1 * k, 0.1 * k, 0, 0))
     rtl.handle(estimate(0.2, (7, 0, math.pi / 2), (0.2, 0, 0)))
-    (said,) = rtl.handle(odometry(1.1, 1.1, 0, 0))
-    assert np.allclose(said.pose_in_area.mean, (7, 0.9, math.pi / 2))
+    (messages,) = rtl.handle(odometry(1.1, 1.1, 0, 0))
+    assert np.allclose(messages.pose_in_area.mean, (7, 0.9, math.pi / 2))
 
 
 def test_an_estimate_between_two_readings_starts_at_its_own_odometry(rtl):
     rtl.handle(odometry(0.0, 0, 0, 0))
     rtl.handle(odometry(1.0, 1, 0, 0))
     rtl.handle(estimate(0.5, (0, 0, 0), (0.5, 0, 0)))
-    (said,) = rtl.handle(odometry(2.0, 2, 0, 0))
-    assert np.allclose(said.pose_in_area.mean, (1.5, 0, 0))
+    (messages,) = rtl.handle(odometry(2.0, 2, 0, 0))
+    assert np.allclose(messages.pose_in_area.mean, (1.5, 0, 0))
 
 
 def test_the_map_pose_is_the_areas_pose_and_the_pose_in_the_area(rtl):
-    rtl.handle(accepted(a0=(0, 0, 0), a3=(10, 0, math.pi / 2)))
+    rtl.handle(make_decision(a0=(0, 0, 0), a3=(10, 0, math.pi / 2)))
     rtl.handle(odometry(0.0, 0, 0, 0))
     rtl.handle(estimate(0.0, (1, 0, 0), (0, 0, 0), area=3))
-    (said,) = rtl.handle(odometry(0.1, 0.5, 0, 0))
-    assert said.area == 3
-    assert np.allclose(said.map_pose.mean, (10, 1.5, math.pi / 2))
-    assert np.allclose(se2.compose(said.map_T_odom, (0.5, 0, 0)), said.map_pose.mean)
-    assert np.linalg.eigvalsh(said.map_pose.covariance - said.pose_in_area.covariance).min() > 0
+    (messages,) = rtl.handle(odometry(0.1, 0.5, 0, 0))
+    assert messages.area == 3
+    assert np.allclose(messages.map_pose.mean, (10, 1.5, math.pi / 2))
+    assert np.allclose(se2.compose(messages.map_T_odom, (0.5, 0, 0)), messages.map_pose.mean)
+    assert np.linalg.eigvalsh(messages.map_pose.covariance - messages.pose_in_area.covariance).min() > 0
 
 
 def test_a_new_area_waits_for_its_place_in_the_map(rtl):
@@ -87,22 +87,22 @@ def test_a_new_area_waits_for_its_place_in_the_map(rtl):
     (before,) = rtl.handle(odometry(0.2, 0.2, 0, 0))
     assert before.area == 0
     assert np.allclose(before.map_pose.mean, (0.2, 0, 0))
-    rtl.handle(accepted(a0=(0, 0, 0), a1=(0.1, 0, 0)))
+    rtl.handle(make_decision(a0=(0, 0, 0), a1=(0.1, 0, 0)))
     (after,) = rtl.handle(odometry(0.3, 0.3, 0, 0))
     assert after.area == 1
     assert np.allclose(after.map_pose.mean, (0.3, 0, 0))
 
 
 def test_the_robots_area_keeps_its_place_when_a_hypothesis_without_it_takes_the_lead(rtl):
-    rtl.handle(accepted(a0=(0, 0, 0), a3=(10, 0, 0)))
+    rtl.handle(make_decision(a0=(0, 0, 0), a3=(10, 0, 0)))
     rtl.handle(odometry(0.0, 0, 0, 0))
     rtl.handle(estimate(0.0, (1, 0, 0), (0, 0, 0), area=3))
-    rtl.handle(accepted(a0=(0, 5, 0), a1=(4, 0, 0)))
-    (said,) = rtl.handle(odometry(0.1, 0.1, 0, 0))
-    assert np.allclose(said.map_pose.mean, (11.1, 0, 0))
+    rtl.handle(make_decision(a0=(0, 5, 0), a1=(4, 0, 0)))
+    (messages,) = rtl.handle(odometry(0.1, 0.1, 0, 0))
+    assert np.allclose(messages.map_pose.mean, (11.1, 0, 0))
     rtl.handle(estimate(0.2, (2, 0, 0), (0.2, 0, 0), area=1))
-    (said,) = rtl.handle(odometry(0.3, 0.3, 0, 0))
-    assert np.allclose(said.map_pose.mean, (6.1, 0, 0))
+    (messages,) = rtl.handle(odometry(0.3, 0.3, 0, 0))
+    assert np.allclose(messages.map_pose.mean, (6.1, 0, 0))
 
 
 def test_the_uncertainty_grows_with_the_path_and_shrinks_with_the_next_estimate(rtl):
@@ -123,15 +123,15 @@ def test_driving_to_and_fro_does_not_make_the_robot_sure_again(rtl):
     assert back.pose_in_area.covariance[0, 0] > there.pose_in_area.covariance[0, 0]
 
 
-def test_an_odometry_reset_is_told_once_and_the_robot_stays_where_it_was(rtl):
+def test_an_odometry_reset_is_reported_once_and_the_robot_stays_where_it_was(rtl):
     rtl.handle(odometry(0.0, 40, 10, 1.0))
     rtl.handle(estimate(0.0, (2, 0, 0), (40, 10, 1.0)))
     rtl.handle(odometry(0.1, 40, 10, 1.0))
-    notice, said = rtl.handle(odometry(0.2, 0, 0, 0))
+    notice, messages = rtl.handle(odometry(0.2, 0, 0, 0))
     (later,) = rtl.handle(odometry(0.3, 0.2, 0, 0))
     assert isinstance(notice, Notice)
     assert "41.23 m" in notice.text
-    assert np.allclose(said.pose_in_area.mean, (2, 0, 0))
+    assert np.allclose(messages.pose_in_area.mean, (2, 0, 0))
     assert np.allclose(later.pose_in_area.mean, (2.2, 0, 0))
 
 
@@ -140,8 +140,8 @@ def test_an_estimate_from_before_a_reset_still_serves(rtl):
     rtl.handle(odometry(0.1, 40.1, 0, 0))
     rtl.handle(odometry(0.2, 0, 0, 0))
     rtl.handle(estimate(0.0, (0, 0, 0), (40, 0, 0)))
-    (said,) = rtl.handle(odometry(0.3, 0.1, 0, 0))
-    assert np.allclose(said.pose_in_area.mean, (0.2, 0, 0))
+    (messages,) = rtl.handle(odometry(0.3, 0.1, 0, 0))
+    assert np.allclose(messages.pose_in_area.mean, (0.2, 0, 0))
 
 
 def test_a_reading_that_is_not_newer_is_passed_over(rtl):
@@ -149,16 +149,16 @@ def test_a_reading_that_is_not_newer_is_passed_over(rtl):
     rtl.handle(estimate(1.0, (0, 0, 0), (0, 0, 0)))
     assert rtl.handle(odometry(1.0, 3, 0, 0)) == []
     assert rtl.handle(odometry(0.5, 3, 0, 0)) == []
-    (said,) = rtl.handle(odometry(1.1, 0.1, 0, 0))
-    assert np.allclose(said.pose_in_area.mean, (0.1, 0, 0))
+    (messages,) = rtl.handle(odometry(1.1, 0.1, 0, 0))
+    assert np.allclose(messages.pose_in_area.mean, (0.1, 0, 0))
 
 
 def test_an_older_estimate_does_not_replace_a_newer_one(rtl):
     rtl.handle(odometry(1.0, 1, 0, 0))
     rtl.handle(estimate(1.0, (1, 0, 0), (1, 0, 0)))
     rtl.handle(estimate(0.5, (9, 9, 0), (0.5, 0, 0)))
-    (said,) = rtl.handle(odometry(1.1, 1.1, 0, 0))
-    assert np.allclose(said.pose_in_area.mean, (1.1, 0, 0))
+    (messages,) = rtl.handle(odometry(1.1, 1.1, 0, 0))
+    assert np.allclose(messages.pose_in_area.mean, (1.1, 0, 0))
 
 
 STEPS = st.lists(st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-0.4, 0.4)), min_size=2, max_size=12)
@@ -175,9 +175,9 @@ def test_when_an_estimate_arrives_does_not_matter_only_which_scan_it_is_of(steps
     belief = estimate(0.0, (1, 2, 3), poses[0])
     at_once.handle(belief)
     for k, pose in enumerate(poses):
-        said = [rtl.handle(Odometry(k * SECOND, pose)) for rtl in (at_once, delayed)]
+        messages = [rtl.handle(Odometry(k * SECOND, pose)) for rtl in (at_once, delayed)]
         if k == late:
             delayed.handle(belief)
-    assert np.allclose(said[0][0].pose_in_area.mean, said[1][0].pose_in_area.mean)
-    assert np.allclose(said[0][0].pose_in_area.covariance, said[1][0].pose_in_area.covariance)
-    assert np.allclose(said[0][0].pose_in_area.mean, se2.compose((1, 2, 3), se2.between(poses[0], poses[-1])))
+    assert np.allclose(messages[0][0].pose_in_area.mean, messages[1][0].pose_in_area.mean)
+    assert np.allclose(messages[0][0].pose_in_area.covariance, messages[1][0].pose_in_area.covariance)
+    assert np.allclose(messages[0][0].pose_in_area.mean, se2.compose((1, 2, 3), se2.between(poses[0], poses[-1])))

@@ -7,7 +7,7 @@ import pytest
 from numba import njit
 from test_registration_scan_to_map import ALIGNMENT, MODEL, ROOM, mapped, seen
 
-from benchmark.allocations import ARRAYS, counted, requirements_on
+from benchmark.allocations import ARRAYS, count_allocations, requirements_on
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.offline.runtime import run_log
 from hmt_slam_ros.open_log import open_log
@@ -22,15 +22,15 @@ FREE = {
 }
 
 
-def test_mapping_takes_no_memory_but_for_the_arrays_that_kernels_are_said_to_make():
+def test_mapping_takes_no_memory_but_for_the_arrays_that_kernels_are_expected_to_make():
     log = open_log(BAG, duration=10.0)
     run_log(log, Configuration())
-    with counted() as counts:
+    with count_allocations() as counts:
         run_log(log, Configuration())
     called = {kernel for kernel, taken in counts.items() if taken}
     assert called >= FREE | {"registration.scan_to_map.propose_all"}
     assert not ARRAYS.keys() & FREE
-    assert not [requirement.row for requirement in requirements_on(counts) if not requirement.met]
+    assert not [requirement.row for requirement in requirements_on(counts) if not requirement.is_met]
 
 
 @pytest.mark.parametrize("particles", [1, 60])
@@ -52,7 +52,7 @@ def test_proposals_take_their_results_alone_for_any_number_of_particles_and_beam
         0.05,
     )
     scan_to_map.propose_all(*arguments)
-    with counted() as counts:
+    with count_allocations() as counts:
         scan_to_map.propose_all(*arguments)
     assert counts["registration.scan_to_map.propose_all"] == [4]
 
@@ -67,8 +67,8 @@ def test_a_kernel_that_takes_memory_is_found_out(monkeypatch):
     monkeypatch.setattr(scan_to_map, "log_prior", log_prior)
     prior = scan_to_map.Prior(np.zeros(3), np.eye(3))
     log_prior(np.ones(3), prior)
-    with counted() as counts:
+    with count_allocations() as counts:
         assert scan_to_map.log_prior(np.ones(3), prior) == -1.5
     assert counts["registration.scan_to_map.log_prior"] == [2]
-    assert [requirement.met for requirement in requirements_on(counts)] == [False]
+    assert [requirement.is_met for requirement in requirements_on(counts)] == [False]
     assert scan_to_map.log_prior is log_prior

@@ -27,7 +27,7 @@ def test_the_ratio_falls_with_every_contradiction(model, usual, samples):
 
 
 @pytest.mark.parametrize("model", [MAP_IN_MAP, SCAN_IN_SUBMAP])
-def test_what_nothing_is_known_of_tells_nothing(model):
+def test_what_nothing_is_known_of_has_no_information(model):
     assert model.log_likelihood_ratio(Agreement(300, 0, 0), 0.01) == 0.0
 
 

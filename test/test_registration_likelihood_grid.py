@@ -77,7 +77,7 @@ def test_scans_without_a_return_give_a_blank_grid():
     assert not grid.log_ratio.any()
 
 
-def test_a_moved_grid_says_the_same_of_the_same_place(room):
+def test_a_moved_grid_gives_the_same_in_the_same_place(room):
     moved = room.shift_origin(np.array([1.0, -2.0]))
     assert log_ratio_at(moved, 5.0, 4.0) == log_ratio_at(room, 6.0, 2.0)
 

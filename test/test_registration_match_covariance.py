@@ -18,7 +18,7 @@ ROOMS = drive((2.0, 2.0), (5.0, 3.0), (10.0, 3.0))
 ALONG = drive((0.0, 0.2), (12.0, 0.2))
 
 
-def driven(walls, truth, seed):
+def track_drive(walls, truth, seed):
     """Steps of a filter along keyframes (n, 3): poses (n, 3) of the keyframes, and what was found of each step."""
     mapping, random = LocalMapping(Configuration(seed=seed)), np.random.default_rng(seed)
     area_filter = ParticleFilter(mapping, 0, area=0)
@@ -44,20 +44,20 @@ def drift(poses, steps):
     return PoseGaussian(se2.between(poses[0], poses[-1]), covariance)
 
 
-def squared(belief, truth):
+def squared_distance(belief, truth):
     xi = se2.log(se2.between(belief.mean, truth))
     return xi @ np.linalg.solve(belief.covariance, xi)
 
 
 @pytest.mark.parametrize(("walls", "truth"), [(two_rooms(), ROOMS), (CORRIDOR, ALONG)])
-def test_steps_and_what_they_add_up_to_are_as_far_off_as_they_say(walls, truth):
+def test_steps_and_what_they_add_up_to_are_as_far_off_as_stated(walls, truth):
     of_steps, of_drift = [], []
     for seed in range(12):
-        poses, steps = driven(walls, truth, seed)
-        of_drift.append(squared(drift(poses, steps), se2.between(truth[0], truth[-1])))
+        poses, steps = track_drive(walls, truth, seed)
+        of_drift.append(squared_distance(drift(poses, steps), se2.between(truth[0], truth[-1])))
         for k, step in enumerate(steps):
             of_steps.append(
-                squared(
+                squared_distance(
                     PoseGaussian(step.increment, step.match_error.pose_covariance), se2.between(truth[k], truth[k + 1])
                 )
             )
@@ -67,7 +67,7 @@ def test_steps_and_what_they_add_up_to_are_as_far_off_as_they_say(walls, truth):
 
 
 def test_along_a_bare_corridor_the_drift_is_that_of_odometry_and_across_it_the_map_bounds_it():
-    poses, steps = driven(CORRIDOR, ALONG, 0)
+    poses, steps = track_drive(CORRIDOR, ALONG, 0)
     deviations = np.sqrt(np.diag(drift(poses, steps).covariance))
     assert deviations[0] == pytest.approx(np.sqrt(len(steps) * ODOMETRY[0, 0]), rel=0.1)
     assert np.sqrt(steps[-1].match_error.drift_covariance[1, 1]) < 0.2 * np.sqrt(ODOMETRY[1, 1])

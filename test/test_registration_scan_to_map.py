@@ -29,18 +29,18 @@ ROOM = np.concatenate((box(-4.02, -3.03, 5.03, 4.01), box(1.01, 1.02, 2.03, 2.52
 CORRIDOR = np.array([[-100.0, -1.22, 100.0, -1.22], [-100.0, 1.22, 100.0, 1.22]])
 
 
-def mapped(walls, poses, beams=721, field_of_view=2 * np.pi):
+def make_map(walls, poses, beams=721, field_of_view=2 * np.pi):
     pool = PatchPool(20, CELL, RADIUS)
     table = pool.empty_table()
     for pose in poses:
         scan = scan_in(walls, pose, beams=beams, field_of_view=field_of_view)
         near = np.hypot(*scan.points.T) < 12.0
-        told = MappedBeams(scan.points[near], np.empty((0, 2)), scan.origins[near])
-        pool.insert(table[None], np.array([pose], dtype=float), told, InverseSensorModel(17, -8, 70))
+        reported = MappedBeams(scan.points[near], np.empty((0, 2)), scan.origins[near])
+        pool.insert(table[None], np.array([pose], dtype=float), reported, InverseSensorModel(17, -8, 70))
     return pool, table
 
 
-def seen(walls, pose, **settings):
+def scan_surfels(walls, pose, **settings):
     """The surfels of a scan."""
     scan = scan_in(walls, pose, **settings)
     return extract_surfels(scan.points, scan.origins)
@@ -48,7 +48,7 @@ def seen(walls, pose, **settings):
 
 @pytest.fixture(scope="module")
 def room():
-    pool, table = mapped(ROOM, [(0, 0, 0), (-1, 0.5, 1), (3, -1, 2)])
+    pool, table = make_map(ROOM, [(0, 0, 0), (-1, 0.5, 1), (3, -1, 2)])
     return pool.view(table)
 
 
@@ -68,7 +68,7 @@ def test_the_likelihood_ratio_equals_the_plain_sum(room, pose):
     assert log_ratio(points, *pose, room, MODEL) == pytest.approx(plain_log_ratio(points, np.array(pose), room))
 
 
-def test_unknown_space_says_nothing_and_known_free_space_contradicts():
+def test_unknown_space_has_no_information_and_known_free_space_contradicts():
     assert MODEL.in_unknown[FAR] == pytest.approx(0.0, abs=1e-3)
     assert MODEL.in_known[FAR] == pytest.approx(np.log(0.1), abs=0.01)
     assert MODEL.in_unknown[0] == pytest.approx(MODEL.in_known[0], abs=0.05)
@@ -78,7 +78,7 @@ def test_unknown_space_says_nothing_and_known_free_space_contradicts():
 @pytest.mark.parametrize("offset", [(0.1, -0.05, 0.03), (-0.15, 0.1, -0.05), (0.0, 0.2, 0.0)])
 def test_gauss_newton_finds_the_true_pose_to_a_third_of_a_cell(room, offset):
     truth = np.array([0.5, -0.4, 0.7])
-    points = seen(ROOM, truth, beams=361, noise=0.01)
+    points = scan_surfels(ROOM, truth, beams=361, noise=0.01)
     start = se2.compose(truth, offset)
     pose, information = align(points, start, Prior(start, np.diag([1.0, 1.0, 1.0])), room, ALIGNMENT)
     assert np.abs(pose - truth)[:2].max() < CELL / 3
@@ -130,9 +130,9 @@ def propose(pool, table, points, truth, deviations):
 
 
 def test_in_a_corridor_the_proposal_keeps_the_prior_along_it_and_is_sharp_across():
-    pool, table = mapped(CORRIDOR, [(x, 0, 0) for x in range(-6, 7)], beams=2881)
+    pool, table = make_map(CORRIDOR, [(x, 0, 0) for x in range(-6, 7)], beams=2881)
     truth = np.array([0.0, 0.1, 0.0])
-    near = seen(CORRIDOR, truth, beams=361, field_of_view=2 * np.pi)
+    near = scan_surfels(CORRIDOR, truth, beams=361, field_of_view=2 * np.pi)
     drawn = propose(pool, table, near[np.hypot(near[:, 0], near[:, 1]) < 5.0], truth, (0.2, 0.2, 0.05))
     along, across = np.sqrt(np.diag(drawn.covariances[0])[:2])
     assert along == pytest.approx(0.2, rel=0.02)
@@ -140,9 +140,11 @@ def test_in_a_corridor_the_proposal_keeps_the_prior_along_it_and_is_sharp_across
 
 
 def test_along_a_corridor_whose_far_walls_are_a_few_cells_a_pose_stays_where_odometry_has_it():
-    pool, table = mapped(CORRIDOR, [(0.0, 0.1, 0.05)], beams=361)
+    pool, table = make_map(CORRIDOR, [(0.0, 0.1, 0.05)], beams=361)
     prior = Prior(np.array([0.5, 0.1, 0.05]), np.diag([1.0 / 0.05**2, 1.0 / 0.05**2, 1.0 / 0.01**2]))
-    pose, information = align(seen(CORRIDOR, prior.mean, beams=361), prior.mean, prior, pool.view(table), ALIGNMENT)
+    pose, information = align(
+        scan_surfels(CORRIDOR, prior.mean, beams=361), prior.mean, prior, pool.view(table), ALIGNMENT
+    )
     assert np.abs(pose - prior.mean).max() < 1e-3
     assert information[0, 0] < 0.02 * prior.information[0, 0]
 
@@ -153,19 +155,19 @@ def test_points_without_normals_are_refused(room):
 
 
 def test_evidence_is_zero_in_unknown_space_positive_in_the_right_place_and_negative_in_a_wrong_one():
-    pool, table = mapped(ROOM, [(0, 0, 0), (-1, 0.5, 1), (3, -1, 2)])
-    points = seen(ROOM, (0, 0, 0))
+    pool, table = make_map(ROOM, [(0, 0, 0), (-1, 0.5, 1), (3, -1, 2)])
+    points = scan_surfels(ROOM, (0, 0, 0))
     deviations = (0.05, 0.05, 0.02)
     empty = pool.empty_table()
     assert propose(pool, empty, points, np.zeros(3), deviations).evidences[0] == pytest.approx(0.0, abs=0.1)
     assert propose(pool, table, points, np.zeros(3), deviations).evidences[0] > 10.0
-    wrong = seen(box(-1.5, -1.5, 1.5, 1.5), (0, 0, 0))
+    wrong = scan_surfels(box(-1.5, -1.5, 1.5, 1.5), (0, 0, 0))
     assert propose(pool, table, wrong, np.zeros(3), deviations).evidences[0] < -3.0
 
 
 def test_a_point_on_the_edge_of_what_beams_passed_contradicts_nothing_and_one_amid_it_does():
     # Sees from straight ahead to the right: whatever stands on the line ahead is grazed.
-    pool, table = mapped(box(-9.0, -9.0, 9.0, 9.0), [(0.0, 0.0, -np.pi / 4)], field_of_view=np.pi / 2)
+    pool, table = make_map(box(-9.0, -9.0, 9.0, 9.0), [(0.0, 0.0, -np.pi / 4)], field_of_view=np.pi / 2)
     along = np.column_stack((np.arange(2.0, 7.0, 0.2), np.zeros(25)))
     for aside, free in ((-0.02, 0), (-0.08, 0), (-0.5, 25)):
         points = along + np.array([0.0, aside])

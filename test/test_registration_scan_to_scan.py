@@ -24,7 +24,7 @@ from hmt_slam_ros.results.final_map import register_scans
 
 OPTIONS = RefinementParameters()
 CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])
-# Through the door and back, every half metre.
+# Through the door and back, every half meter.
 TRUTH = np.concatenate((drive((2.0, 2.0), (5.0, 3.0), (9.0, 3.0)), drive((9.0, 3.2), (5.0, 3.2), (2.0, 2.5))))
 
 
@@ -101,7 +101,7 @@ def test_half_of_the_points_tell_as_much_as_all() -> None:
     assert half[2] == pytest.approx(all_of_them[2], abs=0.03)
 
 
-def test_a_bare_corridor_tells_nothing_of_the_direction_along_it() -> None:
+def test_a_bare_corridor_has_no_information_of_the_direction_along_it() -> None:
     truth = np.array([[0.0, 0.1, 0.0], [0.5, -0.1, 0.05]])
     information, _, share = equations(CORRIDOR, truth, se2.between(truth[1], truth[0]), noise=0.01)
     assert share > 0.5

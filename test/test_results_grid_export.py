@@ -31,7 +31,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out"
 
 
-def served(folder: Path) -> tuple[np.ndarray, float, np.ndarray]:
+def read_served_map(folder: Path) -> tuple[np.ndarray, float, np.ndarray]:
     """Cells (100, 0, -1), resolution and origin as map_server's map_io makes them of the files, in trinary mode."""
     description = yaml.safe_load((folder / "map.yaml").read_text())
     for name, kind in REQUIRED.items():
@@ -64,7 +64,7 @@ def distance_to_walls(points: np.ndarray) -> np.ndarray:
 def test_map_server_sees_the_walls_where_they_are_at_any_resolution(out: Path, tmp_path: Path, resolution) -> None:
     command = ["export", str(out), "--grid", str(tmp_path / "grid"), "--resolution", str(resolution)]
     assert main(command) == 0
-    cells, found, origin = served(tmp_path / "grid")
+    cells, found, origin = read_served_map(tmp_path / "grid")
     assert found == resolution
     assert origin[2] == 0.0
     rows, columns = np.nonzero(cells == 100)
@@ -82,12 +82,12 @@ def test_one_area_stands_in_its_own_frame(out: Path, tmp_path: Path) -> None:
     files = export_grid(out / "hmt_map", tmp_path / "one", area=area)
     assert files == (tmp_path / "one" / "map.pgm", tmp_path / "one" / "map.yaml")
     # The map's frame is that of the first area.
-    whole, one = served(tmp_path / "whole"), served(tmp_path / "one")
+    whole, one = read_served_map(tmp_path / "whole"), read_served_map(tmp_path / "one")
     assert one[1] == whole[1] == saved.configuration.local_map.cell
     assert np.array_equal(one[0], whole[0])
 
 
-def test_what_there_is_no_grid_of_is_told(out: Path, tmp_path: Path, capsys) -> None:
+def test_what_there_is_no_grid_of_is_reported(out: Path, tmp_path: Path, capsys) -> None:
     with pytest.raises(HmtSlamError, match="--area 7 is not in the map: its areas are 0"):
         export_grid(out, tmp_path, area=7)
     with pytest.raises(HmtSlamError, match="--resolution 0 is none for a grid: give"):

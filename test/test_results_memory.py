@@ -19,9 +19,9 @@ print(before["libraries"], before["kernels"], after["libraries"], after["kernels
 """
 
 
-def test_libraries_and_compiled_kernels_are_told_from_data():
-    told = subprocess.run([sys.executable, "-c", COMPILED], capture_output=True, text=True, check=True).stdout
-    libraries, kernels, more_libraries, more_kernels = map(int, told.split())
+def test_libraries_and_compiled_kernels_are_distinguished_from_data():
+    reported = subprocess.run([sys.executable, "-c", COMPILED], capture_output=True, text=True, check=True).stdout
+    libraries, kernels, more_libraries, more_kernels = map(int, reported.split())
     assert libraries > 1_000_000
     assert kernels < more_kernels < 10_000_000
     # LLVM, which compiles, is a library; the ballast is none.

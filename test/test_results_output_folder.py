@@ -54,14 +54,14 @@ def belief(mean: np.ndarray) -> PoseGaussian:
     return PoseGaussian(np.asarray(mean, dtype=float), COVARIANCE)
 
 
-def keyframe(sequence: int, leaves: dict[int, int]) -> Keyframe:
+def keyframe(sequence: int, children: dict[int, int]) -> Keyframe:
     """Keyframe event with {hypothesis: area}; poses are exact in each hypothesis."""
     index = EVERY * sequence
     estimates = tuple(
         HypothesisEstimate(
             hypothesis, area, belief(se2.between(frame(area), TRUTH[index])), True, 0.0, 0.0, Clutter(), 12.0
         )
-        for hypothesis, area in leaves.items()
+        for hypothesis, area in children.items()
     )
     return Keyframe(sequence, scan(index), 6.0 * index / (SCANS - 1), estimates)
 
@@ -75,7 +75,7 @@ def verdict_poses(*areas: int) -> tuple[AreaPose, ...]:
 
 
 def trails() -> list[ScanPoses]:
-    """Hypothesis 0 up to the cut, 1 and 2 after it; 2 is wrong by a metre and must not be used."""
+    """Hypothesis 0 up to the cut, 1 and 2 after it; 2 is wrong by a meter and must not be used."""
     rows = []
     for first in range(0, SCANS, EVERY):
         index = np.arange(first, min(first + EVERY, SCANS))
@@ -89,16 +89,16 @@ def trails() -> list[ScanPoses]:
 
 
 def messages() -> list:
-    said = list(trails())
+    sent = list(trails())
     for index in range(SCANS):
         area = 1 if index > EVERY * CUT else 0
         pose = belief(se2.between(frame(area), TRUTH[index]))
-        said.append(LocalEstimate(int(STAMPS[index]), index, area, pose, TRUTH[index], 0))
+        sent.append(LocalEstimate(int(STAMPS[index]), index, area, pose, TRUTH[index], 0))
     for k in range(SCANS // EVERY):
-        said.append(keyframe(k, {0: 0} if k <= CUT else {1: 1, 2: 0} if k <= VERDICT else {1: 1}))
-        said.append(hypotheses(k))
-        said.append(accepted(k))
-    return [*said, Notice("slam", "two scans had no beam: clean the laser"), EndOfRun(SCANS, SCANS, 0)]
+        sent.append(keyframe(k, {0: 0} if k <= CUT else {1: 1, 2: 0} if k <= VERDICT else {1: 1}))
+        sent.append(hypotheses(k))
+        sent.append(make_decision(k))
+    return [*sent, Notice("slam", "two scans had no beam: clean the laser"), EndOfRun(SCANS, SCANS, 0)]
 
 
 def hypotheses(k: int) -> Hypotheses:
@@ -122,7 +122,7 @@ def hypotheses(k: int) -> Hypotheses:
     return Hypotheses(k, (new, Hypothesis(2, 0, 0.3, 0)))
 
 
-def accepted(k: int) -> ClosureDecision:
+def make_decision(k: int) -> ClosureDecision:
     if k == 0:
         return ClosureDecision(k, global_poses=verdict_poses(0))
     if k == CUT:
@@ -141,26 +141,26 @@ FIGURES = RunMetrics(
 )
 
 
-def recorded(order: int = 0, without: type | None = None) -> Recorder:
-    said = [message for message in messages() if without is None or not isinstance(message, without)]
+def make_recorder(order: int = 0, without: type | None = None) -> Recorder:
+    sent = [message for message in messages() if without is None or not isinstance(message, without)]
     recorder = Recorder(with_changes(Configuration(), {"seed": 7, "local_map.cell": 0.1}))
-    for index in np.random.default_rng(order).permutation(len(said)) if order else range(len(said)):
-        assert recorder.handle(said[index]) == []
+    for index in np.random.default_rng(order).permutation(len(sent)) if order else range(len(sent)):
+        assert recorder.handle(sent[index]) == []
     return recorder
 
 
-def finished(recorder: Recorder) -> FinalMap:
+def finish_map(recorder: Recorder) -> FinalMap:
     return final_map(recorder.finish(STAMPS), map(scan, range(SCANS)), recorder.configuration)
 
 
 def write(directory: Path, recorder: Recorder) -> None:
-    write_output(directory, finished(recorder), SOURCE, FIGURES, recorder.configuration)
+    write_output(directory, finish_map(recorder), SOURCE, FIGURES, recorder.configuration)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("output")
-    write(directory, recorded())
+    write(directory, make_recorder())
     return directory
 
 
@@ -174,40 +174,40 @@ def test_every_file_of_the_design_is_there(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["trajectory.tum", "trajectory_online.tum"])
-def test_both_trajectories_are_true_and_carry_the_logs_own_stamps(folder: Path, name: str) -> None:
+def test_both_trajectories_are_true_and_have_the_logs_own_stamps(folder: Path, name: str) -> None:
     trajectory = read_tum(folder / name)
     np.testing.assert_array_equal(trajectory.stamps, SOURCE)
     np.testing.assert_allclose(trajectory.poses, TRUTH, atol=1e-8)
 
 
 def test_the_order_in_which_messages_arrive_does_not_matter(folder: Path, tmp_path: Path) -> None:
-    write(tmp_path, recorded(order=3))
+    write(tmp_path, make_recorder(order=3))
     assert contents(tmp_path) == contents(folder)
 
 
 def test_a_message_that_comes_twice_counts_once(folder: Path, tmp_path: Path) -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     for message in messages():
         recorder.handle(message)
     write(tmp_path, recorder)
     assert contents(tmp_path) == contents(folder)
 
 
-def test_the_recorder_is_complete_only_when_everything_has_been_heard() -> None:
-    assert recorded().is_complete
+def test_the_recorder_is_complete_only_when_everything_has_arrived() -> None:
+    assert make_recorder().is_complete
     for kind in (EndOfRun, ClosureDecision, Hypotheses, LocalEstimate):
-        assert not recorded(without=kind).is_complete
+        assert not make_recorder(without=kind).is_complete
 
 
 def test_a_lost_message_is_named() -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     del recorder.hypotheses[2]
     with pytest.raises(HmtSlamError, match="Hypotheses 2 was lost"):
         recorder.finish(STAMPS)
 
 
 def test_a_lost_last_message_is_named() -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     del recorder.decisions[SCANS // EVERY - 1]
     with pytest.raises(HmtSlamError, match="was lost"):
         recorder.finish(STAMPS)
@@ -215,16 +215,16 @@ def test_a_lost_last_message_is_named() -> None:
 
 def test_a_run_without_any_pose_is_refused() -> None:
     with pytest.raises(HmtSlamError, match="none of the 24 scans"):
-        recorded(without=LocalEstimate).finish(STAMPS)
+        make_recorder(without=LocalEstimate).finish(STAMPS)
 
 
 def test_a_scan_that_is_not_in_the_log_is_named() -> None:
     with pytest.raises(HmtSlamError, match="is not in the log"):
-        recorded().finish(STAMPS[:-1])
+        make_recorder().finish(STAMPS[:-1])
 
 
-def test_a_scan_without_a_pose_gets_one_between_its_neighbours() -> None:
-    recorder = recorded()
+def test_a_scan_without_a_pose_gets_one_between_its_neighbors() -> None:
+    recorder = make_recorder()
     trail = recorder.scan_poses.pop((1, 16))
     keep = np.array([True, False, True, True])
     recorder.handle(ScanPoses(1, 16, trail.stamps[keep], trail.keyframes[keep], trail.poses[keep]))
@@ -232,7 +232,7 @@ def test_a_scan_without_a_pose_gets_one_between_its_neighbours() -> None:
 
 
 def test_an_area_that_no_verdict_placed_is_placed_along_the_arcs() -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     recorder.decisions[CUT] = ClosureDecision(CUT)
     recording = recorder.finish(STAMPS)
     np.testing.assert_allclose(recording.area_poses[1].mean, MAP_T_AREA_1)
@@ -284,7 +284,7 @@ def test_the_map_shows_the_round_room(folder: Path) -> None:
 
 def test_the_saved_map_reads_back_complete(folder: Path) -> None:
     saved = read_saved_map(folder / "hmt_map")
-    recording = finished(recorded()).recording
+    recording = finish_map(make_recorder()).recording
     hybrid_map = saved.replica.maps[1]
     assert saved.replica.best_hypothesis == recording.replica.best_hypothesis == 1
     assert saved.configuration.seed == 7
@@ -302,7 +302,7 @@ def test_the_saved_map_reads_back_complete(folder: Path) -> None:
 
 
 def test_the_saved_map_keeps_every_live_hypothesis(tmp_path: Path) -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     for k in range(VERDICT, SCANS // EVERY):
         recorder.hypotheses[k] = Hypotheses(k, (Hypothesis(1, 1, 0.6, 1), Hypothesis(2, 2, 0.4, 0)))
         recorder.decisions[k] = ClosureDecision(k)
@@ -314,7 +314,7 @@ def test_the_saved_map_keeps_every_live_hypothesis(tmp_path: Path) -> None:
 
 
 def test_the_saved_map_keeps_that_a_hypothesis_lacks_an_arc(tmp_path: Path) -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     for k in range(VERDICT, SCANS // EVERY):
         withdrawn = (ArcEnds(0, 1),) if k == VERDICT else ()
         recorder.hypotheses[k] = Hypotheses(

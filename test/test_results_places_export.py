@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_floor import AREAS, charted
+from small_floor import AREAS, make_chart
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -16,7 +16,7 @@ BACK = {"north": "south", "south": "north", "east": "west", "west": "east"}
 
 @pytest.fixture(scope="module")
 def document(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    chart, _, _ = charted()
+    chart, _, _ = make_chart()
     poses = {area: PoseGaussian.from_pose(pose) for area, pose in AREAS.items()}
     path: Path = write_places(tmp_path_factory.mktemp("places"), poses, chart)
     assert path.name == "places.json"

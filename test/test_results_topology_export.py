@@ -36,7 +36,7 @@ def numbers(attributes: dict) -> list[float]:
     return [attributes[name] for name in NUMBERS]
 
 
-def of(belief) -> list[float]:
+def belief_numbers(belief) -> list[float]:
     return [*belief.mean.tolist(), *belief.covariance[np.triu_indices(3)].tolist()]
 
 
@@ -48,7 +48,7 @@ def test_areas_and_arcs_read_back_as_the_map_has_them(folder: Path) -> None:
     assert graph.is_directed()
     assert sorted(graph) == hybrid_map.area_ids() == [0, 1]
     for area, attributes in graph.nodes.items():
-        assert numbers(attributes) == of(saved.area_poses[area])
+        assert numbers(attributes) == belief_numbers(saved.area_poses[area])
         assert attributes["keyframes"] == len(hybrid_map.keyframes(area))
         assert attributes["robot"] is (area == 1)
         keyframes = hybrid_map.keyframes(area)
@@ -57,7 +57,7 @@ def test_areas_and_arcs_read_back_as_the_map_has_them(folder: Path) -> None:
     arcs = {(a, b): arc for a, b, arc in hybrid_map.all_arcs()}
     assert set(graph.edges) == set(arcs) == {(0, 1)}
     attributes = graph.edges[0, 1]
-    assert numbers(attributes) == of(arcs[0, 1].pose)
+    assert numbers(attributes) == belief_numbers(arcs[0, 1].pose)
     assert numbers(attributes)[:3] == pytest.approx(MAP_T_AREA_1)
     assert [attributes[name] for name in ("xx", "yy", "tt")] == pytest.approx(np.diag(COVARIANCE))
     assert attributes["closure"] is True
@@ -75,17 +75,20 @@ def test_portals_stand_at_their_arcs_and_landmarks_in_a_file_of_their_own(
     monkeypatch.setattr(export, "find_portals", lambda *_: (portal,))
     graph_file, landmarks_file, _ = export_topology(folder)
     attributes = nx.read_graphml(graph_file, node_type=int).edges[0, 1]
-    assert [attributes[f"portal_{name}"] for name in NUMBERS] == of(belief)
+    assert [attributes[f"portal_{name}"] for name in NUMBERS] == belief_numbers(belief)
     assert (attributes["portals"], attributes["portal_width"], attributes["portal_existence"]) == (1, 0.9, 0.8)
     document = json.loads(landmarks_file.read_text())
     assert set(document["areas"]) == {"0", "1"}
     first, second = document["areas"]["1"]
-    assert (first["kind"], numbers(first), first["width"]) == ("opening", of(belief), 0.9)
+    assert (first["kind"], numbers(first), first["width"]) == ("opening", belief_numbers(belief), 0.9)
     assert (first["existence"], first["seen"], first["missed"]) == (0.8, 4, 1)
     assert second["kind"] == "corner" and "width" not in second
     (only,) = document["portals"]
     assert (only["areas"], only["passages"], only["existence"]) == ([0, 1], 2, 0.8)
-    assert (numbers(only["in_first"]), numbers(only["in_second"])) == (of(belief), of(belief.inverse()))
+    assert (numbers(only["in_first"]), numbers(only["in_second"])) == (
+        belief_numbers(belief),
+        belief_numbers(belief.inverse()),
+    )
 
 
 def test_the_file_is_graphml_and_the_same_every_time(folder: Path) -> None:

@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, 
 PROCESSES = process_names()
 SCANS = 60
 DECIDED = ("scans.bin", "chain.bin", "tlca.bin")
-"""Files of a map with what all processes said and decided."""
+"""Files of a map with what all processes sent and decided."""
 
 
 @pytest.fixture
@@ -31,14 +31,20 @@ def test_the_map_is_that_of_one_host(link, domain, start, tmp_path):
     log, out, saved = corridor_bag(tmp_path, scans=SCANS), tmp_path / "out", tmp_path / "saved"
     alone = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(out)]
     subprocess.run(alone, check=True, timeout=120)
-    listen = [*link.on(1), sys.executable, str(Path(__file__).with_name("listen_on_host.py")), str(domain), str(SCANS)]
+    listen = [
+        *link.host_command(1),
+        sys.executable,
+        str(Path(__file__).with_name("listen_on_host.py")),
+        str(domain),
+        str(SCANS),
+    ]
     with subprocess.Popen(listen, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as listener:
         assert listener.stdout.readline() == "listens\n"
         for name in PROCESSES:
-            start(name, before=link.on(1), save_to=saved)
+            start(name, before=link.host_command(1), save_to=saved)
         start(
             "robot",
-            before=link.on(0),
+            before=link.host_command(0),
             log=log,
             robot__rate=0.0,
             robot__odometry_listeners=2,

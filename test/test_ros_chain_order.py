@@ -1,4 +1,4 @@
-"""Whatever the order in which DDS delivers the topics, a process hears the chain in one order."""
+"""Whatever the order in which DDS delivers the topics, a process receives the chain in one order."""
 
 import pytest
 from hypothesis import given
@@ -27,13 +27,13 @@ HEARD = st.lists(st.sampled_from(CHAIN), min_size=1, max_size=4, unique=True)
 
 
 @given(HEARD, st.integers(1, 6), st.randoms(use_true_random=False))
-def test_any_interleaving_of_the_topics_gives_one_order(heard, events, random):
-    topics = {kind: [message(kind, sequence) for sequence in range(events)] for kind in heard}
-    order, delivered = ChainOrder(heard), []
+def test_any_interleaving_of_the_topics_gives_one_order(received, events, random):
+    topics = {kind: [message(kind, sequence) for sequence in range(events)] for kind in received}
+    order, delivered = ChainOrder(received), []
     while any(topics.values()):
-        kind = random.choice([kind for kind in heard if topics[kind]])
+        kind = random.choice([kind for kind in received if topics[kind]])
         delivered += order.push(topics[kind].pop(0))
-    expected = [(kind, sequence) for sequence in range(events) for kind in CHAIN if kind in heard]
+    expected = [(kind, sequence) for sequence in range(events) for kind in CHAIN if kind in received]
     assert [name(entry) for entry in delivered] == expected
     assert order.waiting_count == 0
     assert order.fault is None
@@ -55,7 +55,7 @@ def test_a_repeated_message_is_put_aside_and_counted():
     assert order.fault is None
 
 
-def test_a_gap_is_told_and_nothing_behind_it_is_delivered():
+def test_a_gap_is_reported_and_nothing_behind_it_is_delivered():
     order = ChainOrder((Keyframe,))
     order.push(message(Keyframe, 0))
     assert order.push(message(Keyframe, 3)) == []

@@ -22,25 +22,25 @@ from hmt_slam_ros.ros.tsbi_node import pmf_message
 from hmt_slam_ros.sensors import Odometry, Scan
 
 STAMPS = st.integers(0, 2**31 * 10**9 - 1)
-# The smallest doubles have too few bits for half of them to be told.
+# Half of the smallest doubles cannot be represented.
 ANGLES = st.floats(-math.pi, math.pi, exclude_max=True).map(lambda angle: angle if abs(angle) > 1e-300 else 0.0)
 METRES = st.floats(-1e6, 1e6)
 
 
-def sent(message):
+def transmit(message):
     """The message as it arrives on the other side."""
     return deserialize_message(serialize_message(message), type(message))
 
 
 @given(STAMPS)
 def test_a_stamp_comes_back_to_the_nanosecond(stamp):
-    assert conversions.stamp_from_time(sent(conversions.time_message(stamp))) == stamp
+    assert conversions.stamp_from_time(transmit(conversions.time_message(stamp))) == stamp
 
 
 @given(STAMPS, METRES, METRES, ANGLES)
 def test_an_odometry_reading_comes_back_bit_for_bit(stamp, x, y, theta):
     reading = Odometry(stamp, np.array([x, y, theta]))
-    back = conversions.odometry_from_message(sent(conversions.odometry_message(reading, "odom", "base_link")))
+    back = conversions.odometry_from_message(transmit(conversions.odometry_message(reading, "odom", "base_link")))
     assert back.stamp == stamp
     assert np.array_equal(back.pose, reading.pose)
 
@@ -50,7 +50,7 @@ def test_a_scan_comes_back_with_all_its_beams(ranges):
     laser = np.array([0.2, -0.1, 0.3])
     angles = [float(np.float32(value)) for value in (-1.5, 0.01, 0.1, 81.9, 1e-5)]
     scan = Scan(123456789123, np.array(ranges, dtype=np.float32), *angles[:4], laser, angles[4])
-    back = conversions.scan_from_message(sent(conversions.scan_message(scan, "laser")), laser)
+    back = conversions.scan_from_message(transmit(conversions.scan_message(scan, "laser")), laser)
     assert back.ranges.tobytes() == scan.ranges.tobytes()
     for name in ("stamp", "angle_min", "angle_increment", "range_min", "range_max", "time_increment"):
         assert getattr(back, name) == getattr(scan, name), name
@@ -65,7 +65,7 @@ def test_the_angles_of_a_laser_that_hangs_upside_down_count_the_other_way():
 def test_the_covariance_is_turned_into_the_axes_of_the_frame():
     # The robot looks along y and is unsure in its own forward direction, so the pose is unsure in y.
     belief = PoseGaussian(np.array([1.0, 2.0, math.pi / 2]), np.diag([0.5, 0.1, 0.02]))
-    message = sent(conversions.pose_with_covariance_message(5, "map", belief))
+    message = transmit(conversions.pose_with_covariance_message(5, "map", belief))
     covariance = np.reshape(message.pose.covariance, (6, 6))
     assert np.allclose(np.diag(covariance), [0.1, 0.5, 0, 0, 0, 0.02])
     back = conversions.gaussian_from_message(message.pose)
@@ -82,7 +82,7 @@ def test_a_trail_comes_back_bit_for_bit(rows, first):
         np.array([row[1] for row in rows], dtype=np.int64),
         np.array([row[2:] for row in rows], dtype=np.float64).reshape(-1, 3),
     )
-    back = conversions.scan_poses_from_message(sent(conversions.path_message(trail)))
+    back = conversions.scan_poses_from_message(transmit(conversions.path_message(trail)))
     assert (back.hypothesis, back.first_scan) == (7, first)
     for name in ("stamps", "keyframes", "poses"):
         assert np.array_equal(getattr(back, name), getattr(trail, name))
@@ -99,12 +99,12 @@ def test_a_path_with_other_frames_is_no_trail(frame):
 
 def test_the_grid_has_its_first_row_at_the_smallest_y():
     pixels = np.array([[OCCUPIED, FREE, FREE], [UNKNOWN, UNKNOWN, FREE]])
-    message = sent(grid_message(1, "map", OccupancyImage(pixels, 0.05, np.array([-1.0, 2.0]))))
+    message = transmit(grid_message(1, "map", OccupancyImage(pixels, 0.05, np.array([-1.0, 2.0]))))
     assert (message.info.width, message.info.height) == (3, 2)
     assert list(message.data) == [-1, -1, 0, 100, 0, 0]
     assert (message.info.origin.position.x, message.info.origin.position.y) == (-1.0, 2.0)
 
 
 def test_the_distribution_names_the_most_probable_path_first_and_what_was_not_examined_last():
-    message = sent(pmf_message(Hypotheses(3, (Hypothesis(4, 4, 0.2, 1), Hypothesis(5, 4, 0.7, 2)), 0.1)))
+    message = transmit(pmf_message(Hypotheses(3, (Hypothesis(4, 4, 0.2, 1), Hypothesis(5, 4, 0.7, 2)), 0.1)))
     assert np.reshape(message.data, (-1, 3)).tolist() == [[5, 2, 0.7], [4, 1, 0.2], [-1, -1, 0.1]]

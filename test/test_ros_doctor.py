@@ -30,7 +30,7 @@ BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 def doctor(listener):
     """Runs it for some seconds, meanwhile spins the test's own nodes, and returns status and findings."""
 
-    def examined(seconds, *arguments, meanwhile=lambda: None):
+    def run_doctor(seconds, *arguments, meanwhile=lambda: None):
         command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "doctor", "--live", "--json"]
         process = subprocess.Popen(
             [*command, "--seconds", str(seconds), *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -38,11 +38,11 @@ def doctor(listener):
         while process.poll() is None:
             meanwhile()
             listener.executor.spin_once(timeout_sec=0.02)
-        said, error = process.communicate()
+        messages, error = process.communicate()
         assert not error
-        return process.returncode, json.loads(said)["findings"]
+        return process.returncode, json.loads(messages)["findings"]
 
-    return examined
+    return run_doctor
 
 
 def texts(findings, *severities):
@@ -56,7 +56,7 @@ def test_a_sound_robot_gets_a_clean_bill(listener, doctor, start):
         "robot__scan_listeners": 0,
         "robot__odometry_listeners": 0,
     }
-    scans = listener.hear(LaserScan, "scan", BEST_EFFORT)
+    scans = listener.subscribe(LaserScan, "scan", BEST_EFFORT)
     robot = start("robot", log=WORLD, **parameters)
     listener.until(lambda: scans, alive=[robot])
     status, findings = doctor(4.0)
@@ -68,7 +68,7 @@ def test_a_sound_robot_gets_a_clean_bill(listener, doctor, start):
     assert any("were compared with odometry" in text for text in fine)
 
 
-def test_what_is_silent_missing_or_does_not_fit_is_told(listener, doctor):
+def test_what_is_silent_missing_or_does_not_fit_is_reported(listener, doctor):
     listener.node.create_publisher(LaserScan, "scan", BEST_EFFORT)
     listener.node.create_subscription(LaserScan, "scan", lambda _: None, 10)
     simulated = Node("slam", context=listener.context, parameter_overrides=[Parameter("use_sim_time", value=True)])
@@ -112,7 +112,7 @@ def test_nodes_that_are_not_active_are_named_with_what_makes_them_so(listener, s
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
-def test_stamps_frames_and_doubled_transforms_are_told_under_a_namespace(listener, doctor):
+def test_stamps_frames_and_doubled_transforms_are_reported_under_a_namespace(listener, doctor):
     records = iter(list(open_log(WORLD, duration=90.0).records()))
     scans = listener.node.create_publisher(LaserScan, "robot1/scan", 10)
     readings = listener.node.create_publisher(OdometryMessage, "robot1/base/odom", 10)

@@ -32,7 +32,7 @@ def test_a_domain_with_a_participant_is_left_alone(monkeypatch):
             assert other != free
 
 
-def test_where_all_are_taken_it_is_told(monkeypatch):
+def test_where_all_are_taken_it_is_reported(monkeypatch):
     monkeypatch.setattr(domains, "_DOMAINS", range(1, 2))
     monkeypatch.setattr(domains, "_is_silent", lambda _: False)
     with pytest.raises(domains.HmtSlamError, match="are in use"), own_domain():

@@ -51,9 +51,9 @@ def system(tmp_path, start):
 
 
 def test_it_explores_and_goes_where_it_is_sent(listener, system):
-    outcomes = listener.hear(String, "explorer/task_result", topics.LATCHED)
-    goals = listener.hear(PoseStamped, "goal_pose", topics.STREAM)
-    truths = listener.hear(PoseStamped, "ground_truth", topics.STREAM)
+    outcomes = listener.subscribe(String, "explorer/task_result", topics.LATCHED)
+    goals = listener.subscribe(PoseStamped, "goal_pose", topics.STREAM)
+    truths = listener.subscribe(PoseStamped, "ground_truth", topics.STREAM)
     nodes = system()
     listener.until(lambda: outcomes, alive=nodes)
     assert outcomes[0].data == "explore: all is known that can be reached; 0 places were given up"
@@ -61,20 +61,18 @@ def test_it_explores_and_goes_where_it_is_sent(listener, system):
     assert np.hypot(*(path - (2.0, 3.0)).T).min() < 2.0
     assert goals
     assert goals[0].header.frame_id == "map"
-    errands = listener.node.create_publisher(String, "explorer/task", 10)
-    listener.until(lambda: errands.get_subscription_count() > 0)
-    errands.publish(String(data="go cellar"))
+    goals_ = listener.node.create_publisher(String, "explorer/task", 10)
+    listener.until(lambda: goals_.get_subscription_count() > 0)
+    goals_.publish(String(data="go cellar"))
     listener.until(lambda: len(outcomes) > 1, alive=nodes)
     assert outcomes[1].data.startswith("go cellar: there is no such place: choose from")
-    errands.publish(String(data="go area 0"))
+    goals_.publish(String(data="go area 0"))
     listener.until(lambda: len(outcomes) > 2, alive=nodes)
     assert outcomes[2].data == "go area 0: the robot is there"
 
 
-def test_with_another_map_it_begins_anew_also_where_it_was_not_there_when_the_map_was_exchanged(
-    listener, system, start
-):
-    outcomes = listener.hear(String, "explorer/task_result", topics.LATCHED)
+def test_with_another_map_it_restarts_also_where_it_was_not_there_when_the_map_was_exchanged(listener, system, start):
+    outcomes = listener.subscribe(String, "explorer/task_result", topics.LATCHED)
     nodes = system()
     *others, explorer, robot = nodes
     listener.until(lambda: outcomes, alive=nodes)
@@ -82,16 +80,16 @@ def test_with_another_map_it_begins_anew_also_where_it_was_not_there_when_the_ma
     listener.until(lambda: len(outcomes) > 1, alive=nodes)
     explorer.kill()
     explorer.communicate()
-    heard = len(outcomes)
+    received = len(outcomes)
     again = start("explorer", laser_pose="[0.0,0.0,0.0]")
-    listener.until(lambda: len(outcomes) > heard, alive=[*others, robot, again])
+    listener.until(lambda: len(outcomes) > received, alive=[*others, robot, again])
     explored = "explore: all is known that can be reached; 0 places were given up"
     assert {outcome.data for outcome in outcomes} == {explored}
 
 
 def test_where_a_part_of_the_map_never_comes_it_ends_with_a_sentence(listener, system, start):
-    """Slam comes back without what it said before its last checkpoint, and the explorer has not heard that."""
-    keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
+    """Slam comes back without what it sent before its last checkpoint, and the explorer did not receive that."""
+    keyframes = listener.subscribe(String, KEYFRAMES, topics.CHAIN)
     nodes = system()
     listener.until(lambda: len(keyframes) > 2, alive=nodes)
     explorer, slam = nodes[-2], nodes[0]
@@ -114,8 +112,8 @@ def test_where_a_part_of_the_map_never_comes_it_ends_with_a_sentence(listener, s
 
 
 def test_others_drive_to_its_goals(listener, system):
-    goals = listener.hear(PoseStamped, "goal_pose", topics.STREAM)
-    truths = listener.hear(PoseStamped, "ground_truth", topics.STREAM)
+    goals = listener.subscribe(PoseStamped, "goal_pose", topics.STREAM)
+    truths = listener.subscribe(PoseStamped, "ground_truth", topics.STREAM)
     nodes = system(explorer__drive="goals")
     listener.until(lambda: goals and len(truths) > 30, alive=nodes)
     assert np.ptp([pose_from_message(message.pose) for message in truths], axis=0).max() < 1e-9

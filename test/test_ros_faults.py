@@ -43,9 +43,9 @@ def kill(process):
 
 def restart(nodes, name, before, **parameters):
     """Start a node that was killed; wait until it has taken over."""
-    said = len(nodes.diagnostics)
+    status_message = len(nodes.diagnostics)
     nodes.alive[before] = nodes.start(name, **parameters)
-    nodes.until(lambda: any(m.status[0].name == f"/{name}" for m in nodes.diagnostics[said:]))
+    nodes.until(lambda: any(m.status[0].name == f"/{name}" for m in nodes.diagnostics[status_message:]))
 
 
 def corridor_measurements(scans):
@@ -73,16 +73,16 @@ class Driver:
     def close(self):
         self._own.close()
 
-    def answered(self):
+    def answered_stamps(self):
         """Stamps of the scans that have a pose, ns."""
         return [decode(message.data, LocalEstimate).stamp for message in self._nodes.estimates]
 
 
 def test_rtl_that_is_killed_goes_on_with_the_pose_and_the_parameters_that_it_had(tmp_path, listener, start):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     odom = listener.node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
     estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
-    placed = listener.hear(PoseWithCovarianceStamped, POSE, topics.STREAM)
+    placed = listener.subscribe(PoseWithCovarianceStamped, POSE, topics.STREAM)
     process = start("rtl", recovery=tmp_path)
     listener.until(lambda: odom.get_subscription_count() and estimates.get_subscription_count(), alive=[process])
     belief = PoseGaussian(np.array([1.0, 2.0, 0.0]), 1e-4 * np.eye(3))
@@ -106,15 +106,17 @@ def test_rtl_that_is_killed_goes_on_with_the_pose_and_the_parameters_that_it_had
     kill(process)
     assert list(tmp_path.iterdir())
 
-    said, heard = len(placed), len(told)
+    status_message, received = len(placed), len(reported)
     process = start("rtl", recovery=tmp_path)
-    listener.until(lambda: len(told) > heard, alive=[process])
-    assert len(placed) == said  # nothing that is past
-    while len(placed) < said + 1:
+    listener.until(lambda: len(reported) > received, alive=[process])
+    assert len(placed) == status_message  # nothing that is past
+    while len(placed) < status_message + 1:
         drive()
         listener.spin(0.05)
-    moved = conversions.stamp_from_time(placed[said].header.stamp) / 20_000_000 - 1
-    assert conversions.pose_from_message(placed[said].pose.pose) == pytest.approx([1.0 + 0.01 * moved, 2.0, 0.0])
+    moved = conversions.stamp_from_time(placed[status_message].header.stamp) / 20_000_000 - 1
+    assert conversions.pose_from_message(placed[status_message].pose.pose) == pytest.approx(
+        [1.0 + 0.01 * moved, 2.0, 0.0]
+    )
     # The answer of the dead one would be waited for.
     client = listener.node.create_client(GetParameters, "rtl/get_parameters")
     future = client.call_async(GetParameters.Request(names=["rtl.publish_tf"]))
@@ -125,7 +127,7 @@ def test_rtl_that_is_killed_goes_on_with_the_pose_and_the_parameters_that_it_had
     assert not list(tmp_path.iterdir())
 
 
-def test_a_process_that_was_dead_while_the_others_began_anew_begins_anew_too(corridor, listener, start, tmp_path):
+def test_a_process_that_was_dead_while_the_others_restarted_restarts_too(corridor, listener, start, tmp_path):
     log, out = corridor
     parameters = {"start_from": out, "start_lost": False, "recovery": tmp_path}
     nodes = Nodes(start, listener, **parameters)
@@ -133,15 +135,15 @@ def test_a_process_that_was_dead_while_the_others_began_anew_begins_anew_too(cor
     nodes.until(lambda: len(nodes.estimates) == 15)
     nodes.park()
     kill(nodes.alive[1])
-    asked = listener.node.create_client(Trigger, "slam/reset").call_async(Trigger.Request())
+    requested = listener.node.create_client(Trigger, "slam/reset").call_async(Trigger.Request())
     listener.spin(0.5)
-    assert not asked.done()
+    assert not requested.done()
     restart(nodes, "aam", 1, **parameters)
-    nodes.until(asked.done)
-    assert asked.result().success, asked.result().message
+    nodes.until(requested.done)
+    assert requested.result().success, requested.result().message
     nodes.drive(log, first=0, robot__duration=6.0)
     nodes.until(lambda: len(nodes.estimates) == 15 + 30)
-    # Of the new map, though slam said keyframes of the same numbers before the reset.
+    # Of the new map, though slam sent keyframes of the same numbers before the reset.
     kill(nodes.alive[1])
     restart(nodes, "aam", 1, **parameters)
     nodes.park()
@@ -154,21 +156,23 @@ def test_a_process_that_was_dead_while_the_others_began_anew_begins_anew_too(cor
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
-def test_all_are_killed_with_what_said_where_the_laser_is_and_go_on_without_it(domain, listener, start, tmp_path):
+def test_all_are_killed_with_the_transform_of_the_laser_and_continue_without_it(domain, listener, start, tmp_path):
     nodes = Nodes(start, listener, recovery=tmp_path / "recovery")
     nodes.drive(corridor_bag(tmp_path, scans=60), first=0, robot__duration=5.9)
     nodes.until(lambda: len(nodes.estimates) == 30)
     for process in nodes.alive:
         kill(process)
-    said = len(nodes.diagnostics)
+    status_message = len(nodes.diagnostics)
     nodes.alive = [start(name, recovery=tmp_path / "recovery") for name in NODES]
-    nodes.until(lambda: {m.status[0].name for m in nodes.diagnostics[said:]} >= {f"/{name}" for name in NODES})
+    nodes.until(
+        lambda: {m.status[0].name for m in nodes.diagnostics[status_message:]} >= {f"/{name}" for name in NODES}
+    )
     driver = Driver(nodes, domain)
     for one in corridor_measurements(60)[150:]:
         driver.send(one)
-    nodes.until(lambda: driver.answered()[-1] == START + 59 * 200_000_000)
-    # What was under way when they were killed is said again.
-    assert sorted(set(driver.answered())) == [START + k * 200_000_000 for k in range(60)]
+    nodes.until(lambda: driver.answered_stamps()[-1] == START + 59 * 200_000_000)
+    # What was under way when they were killed is reported again.
+    assert sorted(set(driver.answered_stamps())) == [START + k * 200_000_000 for k in range(60)]
     end = 4 * 59 * PACE
     nodes.until(
         lambda: nodes.poses and np.abs(conversions.pose_from_message(nodes.poses[-1].pose.pose) - end).max() < 0.1
@@ -181,7 +185,7 @@ def test_all_are_killed_with_what_said_where_the_laser_is_and_go_on_without_it(d
         assert "was killed and goes on where it was" in process.communicate(timeout=20)[1]
 
 
-def disturbed(measurements, period):
+def disturb(measurements, period):
     """Measurements of one kind, ``period`` ns apart, as (time of arrival, measurement).
 
     Some come after their successor, some 0.3 s late, some twice, and one 5 s late.
@@ -204,17 +208,17 @@ def test_what_comes_late_twice_or_out_of_order_is_left_out_and_counted_and_all_e
     driver = Driver(nodes, domain)
     kinds = {Scan: SECOND // 5, Odometry: SECOND // 20}
     sent = {kind: [one for one in corridor_measurements(60) if isinstance(one, kind)] for kind in kinds}
-    arrivals = sorted((entry for kind in kinds for entry in disturbed(sent[kind], kinds[kind])), key=lambda e: e[0])
+    arrivals = sorted((entry for kind in kinds for entry in disturb(sent[kind], kinds[kind])), key=lambda e: e[0])
     came = {kind: [one.stamp for _, one in arrivals if isinstance(one, kind)] for kind in kinds}
     used = {kind: in_order(came[kind]) for kind in kinds}
     assert all(len(came[kind]) > len(sent[kind]) > len(used[kind]) for kind in kinds)
     for number, (_, one) in enumerate(arrivals):
         driver.send(one)
         # As a laser does, which waits for nobody, but no faster than slam is on a computer that is busy.
-        nodes.until(lambda now=one.stamp: now < 2 * SECOND + (driver.answered() or [START])[-1])
+        nodes.until(lambda now=one.stamp: now < 2 * SECOND + (driver.answered_stamps() or [START])[-1])
         if number == len(arrivals) // 2:
             nodes.until(lambda: nodes.diagnosis("rtl")["received LocalEstimate"])
-    nodes.until(lambda: driver.answered() == used[Scan])
+    nodes.until(lambda: driver.answered_stamps() == used[Scan])
     nodes.until(lambda: nodes.poses and conversions.stamp_from_time(nodes.poses[-1].header.stamp) == used[Odometry][-1])
     for message in nodes.poses:
         assert_true(message, START)
@@ -271,16 +275,16 @@ def test_a_laser_falls_silent_a_disk_is_full_and_time_jumps_back(listener, start
     FolderReader(tmp_path / "map", FORMAT, VERSION)
     for process in nodes.alive[:5]:
         process.send_signal(signal.SIGINT)
-    told = slam.communicate(timeout=20)[1]
-    assert "scans come again, after" in told
-    assert "time went back by" in told
-    assert "the node goes on, but if it is killed all have to be restarted; make room there" in told
+    reported = slam.communicate(timeout=20)[1]
+    assert "scans come again, after" in reported
+    assert "time went back by" in reported
+    assert "the node goes on, but if it is killed all have to be restarted; make room there" in reported
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
-def test_a_missing_transform_and_clocks_that_are_apart_are_told_with_the_remedy(listener, start):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
-    keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
+def test_a_missing_transform_and_clocks_that_are_apart_are_reported_with_the_remedy(listener, start):
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    keyframes = listener.subscribe(String, KEYFRAMES, topics.CHAIN)
     scans = listener.node.create_publisher(LaserScan, SCAN, topics.SENSOR)
     odom = listener.node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
     static = listener.node.create_publisher(TFMessage, "tf_static", topics.LATCHED)
@@ -296,17 +300,17 @@ def test_a_missing_transform_and_clocks_that_are_apart_are_told_with_the_remedy(
         else:
             odom.publish(conversions.odometry_message(one, "odom", "base_link"))
 
-    def said():
-        return next((m.status[0].message for m in reversed(told) if m.status[0].name == "/slam"), "")
+    def status_message():
+        return next((m.status[0].message for m in reversed(reported) if m.status[0].name == "/slam"), "")
 
-    listener.until(lambda: "no transform" in said(), alive=[process])
-    assert said() == (
+    listener.until(lambda: "no transform" in status_message(), alive=[process])
+    assert status_message() == (
         "no transform from 'base_link' to 'laser' on /tf_static, so 55 scans wait, the first of stamp "
         f"{measurements[0].stamp + hour} ns: publish it, or set the parameter laser_pose"
     )
     assert not keyframes
     static.publish(TFMessage(transforms=[conversions.transform_message(0, "base_link", "laser", np.zeros(3))]))
-    listener.until(lambda: keyframes and "no transform" not in said(), alive=[process])
+    listener.until(lambda: keyframes and "no transform" not in status_message(), alive=[process])
     process.send_signal(signal.SIGINT)
     error = process.communicate(timeout=20)[1]
     assert " s after the odometry that comes with them: let both computers have one clock" in error
@@ -319,7 +323,7 @@ def joints(messages):
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
-def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_that_is_told_to_be(
+def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_that_is_configured_so(
     listener, start, tmp_path
 ):
     names = {"map": "map", "odom": "odom", "base": "base_link", "laser": "laser"}
@@ -328,9 +332,9 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
     two = Nodes(
         start, listener, "-r", "tf:=/tf", "-r", "tf_static:=/tf_static", namespace="/two", recovery=tmp_path, **frames
     )
-    maps = {nodes: nodes.hear(OccupancyGrid, MAP, topics.LATCHED) for nodes in (one, two)}
-    tf = {topic: listener.hear(TFMessage, topic, topics.TF_STATIC) for topic in ("/one/tf_static", "/tf_static")}
-    tf |= {topic: listener.hear(TFMessage, topic, topics.STREAM) for topic in ("/one/tf", "/tf")}
+    maps = {nodes: nodes.subscribe(OccupancyGrid, MAP, topics.LATCHED) for nodes in (one, two)}
+    tf = {topic: listener.subscribe(TFMessage, topic, topics.TF_STATIC) for topic in ("/one/tf_static", "/tf_static")}
+    tf |= {topic: listener.subscribe(TFMessage, topic, topics.STREAM) for topic in ("/one/tf", "/tf")}
     drives = {one: 40, two: 60}
     for nodes, scans in drives.items():
         folder = tmp_path / f"log_{scans}"
@@ -348,8 +352,8 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
         nodes.until(lambda nodes=nodes, scans=scans: nodes.diagnosis("slam")["received Scan"] == str(scans))
         nodes.until(lambda nodes=nodes: maps[nodes])
         # The robot goes on to say that its log has ended.
-        statuses = nodes.hear(String, ROBOT_STATUS, topics.LATCHED)
-        nodes.until(lambda heard=statuses: len(heard) >= 8)
+        statuses = nodes.subscribe(String, ROBOT_STATUS, topics.LATCHED)
+        nodes.until(lambda received=statuses: len(received) >= 8)
         awaited = len(nodes.diagnostics) + 2 * len(NODES)
         nodes.until(lambda nodes=nodes, awaited=awaited: len(nodes.diagnostics) > awaited)
         assert nodes.diagnosis("slam")["sent EndOfRun"] == "1"

@@ -1,4 +1,4 @@
-"""Every node starts, says how it is, and ends with status 0 when told to."""
+"""Every node starts, says how it is, and ends with status 0 on request."""
 
 import signal
 import subprocess
@@ -33,12 +33,12 @@ def parameters(name, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
-def test_every_node_that_runs_ends_well_when_told_to(tmp_path, listener, start, number):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+def test_every_node_that_runs_ends_well_on_request(tmp_path, listener, start, number):
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     processes = {name: start(name, **parameters(name, tmp_path)) for name in NODES}
-    listener.until(lambda: all(level(told, name) for name in NODES), alive=processes.values())
+    listener.until(lambda: all(level(reported, name) for name in NODES), alive=processes.values())
     for name, process in processes.items():
-        assert level(told, name).level == DiagnosticStatus.OK
+        assert level(reported, name).level == DiagnosticStatus.OK
         process.send_signal(number)
     for name, process in processes.items():
         error = process.communicate(timeout=20)[1]
@@ -57,7 +57,7 @@ def test_a_value_out_of_range_keeps_every_node_from_starting(tmp_path, start):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
-def test_a_node_that_is_still_being_loaded_ends_well_when_told_to(start, number):
+def test_a_node_that_is_still_being_loaded_ends_well_on_request(start, number):
     processes = []
     for moment in range(6):
         processes.append(start("slam"))
@@ -77,65 +77,69 @@ def heeds_sigterm(pid):
 
 
 def test_two_signals_in_a_row_do_no_harm(listener, start):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     process = start("rtl")
-    listener.until(lambda: told)
+    listener.until(lambda: reported)
     process.send_signal(signal.SIGINT)
     process.send_signal(signal.SIGINT)
     error = process.communicate(timeout=20)[1]
     assert process.returncode == 0, error
 
 
-def level(told, name):
-    levels = [status for message in told for status in message.status if status.name == f"/{name}"]
+def level(reported, name):
+    levels = [status for message in reported for status in message.status if status.name == f"/{name}"]
     return levels[-1] if levels else None
 
 
-def test_a_malformed_document_is_told_and_survived(listener, start):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+def test_a_malformed_document_is_reported_and_survived(listener, start):
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     events = listener.node.create_publisher(String, DOCUMENTS[ClosureDecision], topics.CHAIN)
     process = start("rtl")
     events.publish(String(data='{"document":"closure_decision","version":99}'))
-    listener.until(lambda: (status := level(told, "rtl")) and status.level == DiagnosticStatus.ERROR, alive=[process])
-    assert "has version 99, not 1" in level(told, "rtl").message
+    listener.until(
+        lambda: (status := level(reported, "rtl")) and status.level == DiagnosticStatus.ERROR, alive=[process]
+    )
+    assert "has version 99, not 1" in level(reported, "rtl").message
 
 
-def test_a_lost_message_of_the_chain_is_told(listener, start):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+def test_a_lost_message_of_the_chain_is_reported(listener, start):
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     accepted = listener.node.create_publisher(String, DOCUMENTS[ClosureDecision], topics.CHAIN)
     process = start("rtl")
     accepted.publish(String(data=encode(ClosureDecision(0))))
     accepted.publish(String(data=encode(ClosureDecision(2))))
-    listener.until(lambda: (status := level(told, "rtl")) and status.level == DiagnosticStatus.ERROR, alive=[process])
-    assert "ClosureDecision 1 never came, 2 did" in level(told, "rtl").message
+    listener.until(
+        lambda: (status := level(reported, "rtl")) and status.level == DiagnosticStatus.ERROR, alive=[process]
+    )
+    assert "ClosureDecision 1 never came, 2 did" in level(reported, "rtl").message
 
 
 def test_a_node_that_starts_late_catches_up(listener, start):
-    """What was said before a node started is latched, and reaches it in the order of the chain."""
+    """What was reported before a node started is latched, and reaches it in the order of the chain."""
     keyframes = listener.node.create_publisher(String, KEYFRAMES, topics.CHAIN)
     hypotheses = listener.node.create_publisher(String, DOCUMENTS[Hypotheses], topics.CHAIN)
     accepted = listener.node.create_publisher(String, DOCUMENTS[ClosureDecision], topics.CHAIN)
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     assert keyframes
     for sequence in range(3):
         hypotheses.publish(String(data=encode(Hypotheses(sequence, (Hypothesis(0, 0, 1.0, 0),)))))
         accepted.publish(String(data=encode(ClosureDecision(sequence))))
     process = start("rtl")
 
-    def received():
-        status = level(told, "rtl")
+    def status_values():
+        status = level(reported, "rtl")
         return {entry.key: entry.value for entry in status.values} if status else {}
 
-    listener.until(lambda: received().get("received ClosureDecision") == "3", alive=[process])
-    listener.until(lambda: received().get("received Hypotheses") == "3", alive=[process])
-    listener.until(lambda: received().get("waiting for their turn") == "0", alive=[process])
+    listener.until(lambda: status_values().get("received ClosureDecision") == "3", alive=[process])
+    listener.until(lambda: status_values().get("received Hypotheses") == "3", alive=[process])
+    listener.until(lambda: status_values().get("waiting for their turn") == "0", alive=[process])
 
 
 def test_rtl_answers_every_odometry_reading(listener, start):
     odom = listener.node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
     estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
-    local = listener.hear(PoseWithCovarianceStamped, HMT_POSE, topics.STREAM)
-    placed = listener.hear(PoseWithCovarianceStamped, POSE, topics.STREAM)
+    local = listener.subscribe(PoseWithCovarianceStamped, HMT_POSE, topics.STREAM)
+    placed = listener.subscribe(PoseWithCovarianceStamped, POSE, topics.STREAM)
     process = start("rtl")
     matched = (odom, estimates)
     listener.until(lambda: all(publisher.get_subscription_count() for publisher in matched), alive=[process])
@@ -161,7 +165,7 @@ def test_rtl_answers_every_odometry_reading(listener, start):
 def test_rtl_publishes_the_transform_from_map_to_odom(listener, start):
     reason = "tf2_msgs is not installed: run scripts/test.sh, which builds it"
     TFMessage = pytest.importorskip("tf2_msgs.msg", reason=reason).TFMessage
-    moving = listener.hear(TFMessage, "tf", topics.STREAM)
+    moving = listener.subscribe(TFMessage, "tf", topics.STREAM)
     odom = listener.node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
     estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
     start("rtl")
@@ -178,29 +182,29 @@ def test_rtl_publishes_the_transform_from_map_to_odom(listener, start):
     assert (joint.transform.translation.x, joint.transform.translation.y) == pytest.approx((-4.0, 2.0))
 
 
-def test_a_driver_that_may_lose_messages_is_heard_too(listener, start):
+def test_a_best_effort_driver_is_received_too(listener, start):
     live = listener.node.create_publisher(OdometryMessage, "odom", topics.LIVE_SENSOR)
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     process = start("rtl")
     reading = Odometry(0, np.zeros(3))
 
-    def counted():
-        status = level(told, "rtl")
+    def has_count():
+        status = level(reported, "rtl")
         return status is not None and any(entry.key == "received Odometry" for entry in status.values)
 
-    while not counted():
+    while not has_count():
         reading = Odometry(reading.stamp + 20_000_000, reading.pose)
         live.publish(conversions.odometry_message(reading, "odom", "base_link"))
         listener.spin(0.1)
         assert process.poll() is None
 
 
-def test_aam_answers_nothing_it_was_not_asked(listener, start):
-    answers = listener.hear(String, DOCUMENTS[AreaEvents], topics.CHAIN)
-    costs = listener.hear(Float64MultiArray, "hmt/cost", topics.CHAIN)
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+def test_aam_answers_only_to_keyframes(listener, start):
+    answers = listener.subscribe(String, DOCUMENTS[AreaEvents], topics.CHAIN)
+    costs = listener.subscribe(Float64MultiArray, "hmt/cost", topics.CHAIN)
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     start("aam")
-    listener.until(lambda: told)
+    listener.until(lambda: reported)
     assert not answers
     assert not costs
 
@@ -214,10 +218,10 @@ def test_a_node_ends_with_the_program_that_started_it(listener):
         "print(node.pid, flush=True)\n"
         "time.sleep(600)\n"
     )
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
     node = int(parent.stdout.readline())
-    listener.until(lambda: told, alive=[parent])
+    listener.until(lambda: reported, alive=[parent])
     assert is_alive(node)
     parent.kill()
     parent.communicate()

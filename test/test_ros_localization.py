@@ -1,4 +1,4 @@
-"""Nodes that start from a map, or whose robot is carried, do not know where it is until they recognize the place."""
+"""Nodes that start from a map, or whose robot is kidnapped, do not know where it is until they recognize the place."""
 
 import math
 import subprocess
@@ -44,22 +44,22 @@ def corridor(tmp_path_factory):
 
 
 class Nodes:
-    """The five processes, robots one after the other, and what is heard of them, in a namespace such as "/robot"."""
+    """The five processes, robots one after the other, and their messages, in a namespace such as "/robot"."""
 
     def __init__(self, start, listener, *arguments, namespace="", **parameters):
         self.start, self.listener, self.namespace = start, listener, namespace
         self.arguments = (*arguments, *(["-r", f"__ns:={namespace}"] if namespace else []))
-        self.localized = self.hear(Bool, IS_LOCALIZED, topics.LATCHED)
-        self.entropies = self.hear(Float64, ENTROPY, topics.LATCHED)
-        self.estimates = self.hear(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
-        self.notices = self.hear(String, DOCUMENTS[Notice], topics.CHAIN)
-        self.poses = self.hear(PoseWithCovarianceStamped, POSE, topics.STREAM)
-        self.diagnostics = self.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+        self.localized = self.subscribe(Bool, IS_LOCALIZED, topics.LATCHED)
+        self.entropies = self.subscribe(Float64, ENTROPY, topics.LATCHED)
+        self.estimates = self.subscribe(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
+        self.notices = self.subscribe(String, DOCUMENTS[Notice], topics.CHAIN)
+        self.poses = self.subscribe(PoseWithCovarianceStamped, POSE, topics.STREAM)
+        self.diagnostics = self.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
         self.alive = [start(name, *self.arguments, **parameters) for name in NODES]
 
-    def hear(self, kind, topic, profile):
+    def subscribe(self, kind, topic, profile):
         """What comes on a topic of these nodes."""
-        return self.listener.hear(kind, f"{self.namespace}/{topic}", profile)
+        return self.listener.subscribe(kind, f"{self.namespace}/{topic}", profile)
 
     def until(self, condition):
         self.listener.until(condition, alive=self.alive)
@@ -80,9 +80,9 @@ class Nodes:
         return bool(self.localized) and self.localized[-1].data
 
     def diagnosis(self, node):
-        """What a node said of itself last, {name: value}; values are empty while it said nothing."""
-        said = (m.status[0] for m in reversed(self.diagnostics) if m.status[0].name == f"{self.namespace}/{node}")
-        return defaultdict(str, {value.key: value.value for status in islice(said, 1) for value in status.values})
+        """The last status of a node, {name: value}; values are empty while it was silent."""
+        messages = (m.status[0] for m in reversed(self.diagnostics) if m.status[0].name == f"{self.namespace}/{node}")
+        return defaultdict(str, {value.key: value.value for status in islice(messages, 1) for value in status.values})
 
 
 def assert_true(message, begin):
@@ -94,7 +94,7 @@ def assert_true(message, begin):
     assert np.abs(pose_from_message(message.pose.pose) - k * PACE).max() < 0.15
 
 
-def test_a_robot_that_wakes_up_in_a_saved_map_says_so_until_it_is_recognized_where_it_is(corridor, listener, start):
+def test_a_robot_that_starts_lost_in_a_saved_map_reports_it_until_it_is_relocalized(corridor, listener, start):
     log, out = corridor
     nodes = Nodes(start, listener, start_from=out)
     nodes.until(lambda: nodes.localized and nodes.entropies)
@@ -114,21 +114,21 @@ def test_a_robot_that_wakes_up_in_a_saved_map_says_so_until_it_is_recognized_whe
     assert nodes.entropies[-1].data < 0.3
 
 
-def test_a_robot_that_stayed_where_it_was_is_localized_at_once_where_that_is_told(corridor, listener, start):
+def test_a_robot_that_stayed_where_it_was_is_localized_at_once_with_an_initial_pose(corridor, listener, start):
     nodes = Nodes(start, listener, start_from=corridor[1], start_lost=False)
     nodes.until(lambda: nodes.localized and nodes.entropies)
     assert nodes.is_localized()
     assert nodes.entropies[-1].data == 0.0
 
 
-def test_a_robot_that_is_carried_while_the_nodes_run_is_recognized_elsewhere(corridor, listener, start):
+def test_a_robot_that_is_kidnapped_while_the_nodes_run_is_recognized_elsewhere(corridor, listener, start):
     log, out = corridor
     nodes = Nodes(start, listener, start_from=out, start_lost=False)
     nodes.until(nodes.is_localized)
     answer = listener.call(Trigger, "slam/relocalize", Trigger.Request())
     assert answer.success
     nodes.until(lambda: not nodes.is_localized())
-    # Back in time, which an odometry and a clock that begin anew are.
+    # Back in time, which an odometry and a clock that restart are.
     nodes.drive(log, first=40, rate=8.0)
     nodes.until(nodes.is_localized)
     nodes.until(lambda: len(nodes.estimates) == SCANS - 40)
@@ -136,18 +136,18 @@ def test_a_robot_that_is_carried_while_the_nodes_run_is_recognized_elsewhere(cor
     again = listener.call(Trigger, "slam/relocalize", Trigger.Request())
     assert again.success
     nodes.until(lambda: not nodes.is_localized())
-    said = len(nodes.poses)
-    # As slowly as rtl needs to have been told where the robot is before the last odometry comes.
+    messages = len(nodes.poses)
+    # Slowly enough that rtl has the estimate before the last odometry.
     nodes.drive(log, first=0, rate=4.0)
     nodes.until(nodes.is_localized)
     nodes.until(lambda: len(nodes.estimates) == SCANS - 40 + SCANS)
     listener.spin(1.5)
-    assert len(nodes.poses) > said
+    assert len(nodes.poses) > messages
     begin = stamp_from_time(nodes.poses[-1].header.stamp) - (SCANS - 1) * 200_000_000
     assert_true(nodes.poses[-1], begin)
 
 
-def test_a_robot_that_is_carried_while_it_drives_notices_and_is_recognized(listener, start):
+def test_a_robot_that_is_kidnapped_while_it_drives_notices_and_is_recognized(listener, start):
     nodes = Nodes(start, listener)
     nodes.until(nodes.is_localized)
     nodes.drive(CARRIED, first=0, robot__duration=84.0)
@@ -173,7 +173,7 @@ def test_a_person_says_where_the_robot_is_and_where_it_cannot_be(corridor, liste
     assert "initialpose is left out: (100.00, 50.00) is outside of the map" in complaint
     publisher.publish(initial_pose(np.zeros(3), frame="odom"))
     nodes.until(lambda: "the pose is in the frame 'odom', not in 'map'" in nodes.diagnosis("slam")["last error"])
-    # Lost, and told 0.4 m beside where it is: a keyframe later it is recognized, else it takes five.
+    # Lost, and with an initial pose 0.4 m beside where it is: a keyframe later it is recognized, else it takes five.
     nodes.drive(log, first=20, robot__duration=2.5)
     nodes.until(lambda: len(nodes.estimates) == 13)
     assert not nodes.is_localized()
@@ -184,7 +184,7 @@ def test_a_person_says_where_the_robot_is_and_where_it_cannot_be(corridor, liste
     nodes.until(nodes.is_localized)
     nodes.until(lambda: len(nodes.estimates) == 13 + 10)
     nodes.park()
-    # While it knows its place, it is told of another one, where it is put.
+    # While it is localized, it is put to another place with an initial pose.
     publisher.publish(initial_pose(4 * 80 * PACE + [0.3, -0.25, 0.1]))
     nodes.until(lambda: not nodes.is_localized())
     # As slowly as odometry comes, which rtl answers.

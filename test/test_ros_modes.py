@@ -36,9 +36,9 @@ def set_mode(listener, mode):
     return listener.call(SetParameters, "slam/set_parameters", request).results[0]
 
 
-def stored(keyframes):
+def are_stored(keyframes):
     """Whether keyframes were stored under any hypothesis."""
-    return [any(leaf.stored for leaf in head(message).estimates) for message in keyframes]
+    return [any(hypothesis.stored for hypothesis in head(message).estimates) for message in keyframes]
 
 
 def head(message):
@@ -48,14 +48,14 @@ def head(message):
 def test_a_robot_is_recognized_and_tracked_in_a_map_that_is_saved_as_it_was_loaded(corridor, listener, start, tmp_path):
     log, out = corridor
     nodes = Nodes(start, listener, start_from=out, mode="localization", save_to=tmp_path / "saved")
-    keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
+    keyframes = listener.subscribe(String, KEYFRAMES, topics.CHAIN)
     pointing = listener.node.create_publisher(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
     nodes.drive(log, first=20, rate=8.0)
     nodes.until(nodes.is_localized)
     nodes.until(lambda: len(nodes.estimates) == SCANS - 20)
     end = 4 * (SCANS - 1) * PACE
     nodes.until(lambda: nodes.poses and np.abs(pose_from_message(nodes.poses[-1].pose.pose) - end).max() < 0.15)
-    while_lost = stored(keyframes)
+    while_lost = are_stored(keyframes)
     # What it needs to be recognized, which is two looks at five keyframes each and what came meanwhile; nothing since.
     recognized = while_lost.index(False)
     assert 0 < recognized <= 14
@@ -92,15 +92,15 @@ def test_a_robot_is_recognized_and_tracked_in_a_map_that_is_saved_as_it_was_load
 def test_offline_too_the_map_stays_as_it_was(corridor, tmp_path):
     log, out = corridor
 
-    def mapped(*arguments):
+    def run_map(*arguments):
         command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(tmp_path / "out")]
         return subprocess.run([*command, *arguments], check=False, capture_output=True, text=True, timeout=120)
 
-    found = mapped("--from", str(out), "--mode", "localization", "--start", "4.0")
+    found = run_map("--from", str(out), "--mode", "localization", "--start", "4.0")
     assert found.returncode == 0, found.stderr
     assert content(tmp_path / "out" / "hmt_map") == content(out / "hmt_map")
     poses = np.loadtxt(tmp_path / "out" / "trajectory.tum")
     assert np.abs(poses[-1, 1:3] - 4 * (SCANS - 1) * PACE[:2]).max() < 0.1
-    alone = mapped("--mode", "localization")
+    alone = run_map("--mode", "localization")
     assert alone.returncode == 2
     assert "mode = localization wants a map to find the robot in: give --from" in alone.stderr

@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from door_floor import ROOM, in_hallway, scripted, write_world
+from door_floor import ROOM, in_hallway, scripted_drive, write_world
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -28,7 +28,7 @@ PROCESSES = process_names()
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory):
+def mapped_world(tmp_path_factory):
     """The world, and the folder of its map."""
     folder = tmp_path_factory.mktemp("floor")
     world, out = write_world(folder), folder / "out"
@@ -37,27 +37,27 @@ def mapped(tmp_path_factory):
     return world, out
 
 
-def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, start):
-    world, out = mapped
+def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped_world, listener, start):
+    world, out = mapped_world
     # Slam alone would not look for the robot before it is there.
     shared = {"start_from": out, "mode": "localization", "tsbi__recheck_keyframes": 100}
-    outcomes = listener.hear(String, "pilot/task_result", topics.LATCHED)
-    places = listener.hear(String, PLACE, topics.LATCHED)
-    starts = listener.hear(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
-    goals = listener.hear(PoseStamped, GOAL_POSE, topics.STREAM)
-    truths = listener.hear(PoseStamped, "ground_truth", topics.STREAM)
-    localized = listener.hear(Bool, IS_LOCALIZED, topics.LATCHED)
-    diagnostics = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    outcomes = listener.subscribe(String, "pilot/task_result", topics.LATCHED)
+    places = listener.subscribe(String, PLACE, topics.LATCHED)
+    starts = listener.subscribe(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
+    goals = listener.subscribe(PoseStamped, GOAL_POSE, topics.STREAM)
+    truths = listener.subscribe(PoseStamped, "ground_truth", topics.STREAM)
+    localized = listener.subscribe(Bool, IS_LOCALIZED, topics.LATCHED)
+    diagnostics = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     pilot = start("pilot", **shared)
     others = [start(name, **shared) for name in PROCESSES]
-    errands = listener.node.create_publisher(String, "pilot/task", topics.STREAM)
-    listener.until(lambda: errands.get_subscription_count() == 1, alive=[pilot])
-    errands.publish(String(data="go cellar"))
-    errands.publish(String(data="dance"))
+    goals_ = listener.node.create_publisher(String, "pilot/task", topics.STREAM)
+    listener.until(lambda: goals_.get_subscription_count() == 1, alive=[pilot])
+    goals_.publish(String(data="go cellar"))
+    goals_.publish(String(data="dance"))
     listener.until(lambda: outcomes, alive=[pilot])
     sentence, _, room = outcomes[0].data.rpartition(" from ")
     assert sentence == "go cellar: there is no such room: choose"
-    errands.publish(String(data=f"go {room}"))
+    goals_.publish(String(data=f"go {room}"))
     robot = start(
         "robot",
         log=world,
@@ -71,15 +71,15 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, star
     listener.until(lambda: len(outcomes) == 2, alive=[pilot, robot, *others])
     assert outcomes[1].data == f"go {room}: the robot is there"
     # The map's frame is where the scripted drive began.
-    origin = scripted(world)[1][0]
+    origin = scripted_drive(world)[1][0]
     (goal,) = goals
     assert goal.header.frame_id == "map"
     place = se2.compose(origin, pose_from_message(goal.pose))
-    # The last keyframe in the room is up to half a metre before the drive's end.
+    # The last keyframe in the room is up to half a meter before the drive's end.
     np.testing.assert_allclose(place, (ROOM[0], ROOM[1] - 0.25, 0.5 * math.pi), atol=0.25)
     assert math.dist(pose_from_message(truths[-1].pose)[:2], place[:2]) < 0.2
-    said = [value.value for m in diagnostics if m.status[0].name == "/pilot" for value in m.status[0].values]
-    assert "'dance' is no task: give one of localize, stop, or go and the name of a place" in said
+    messages = [value.value for m in diagnostics if m.status[0].name == "/pilot" for value in m.status[0].values]
+    assert "'dance' is no task: give one of localize, stop, or go and the name of a place" in messages
     last = decode(places[-1].data, PlaceEstimate)
     assert (last.place, last.room, last.confident) == (room.replace("room", "door"), room, True)
     (begun,) = starts
@@ -89,7 +89,7 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped, listener, star
     assert np.abs(off).max() < 0.05, off
     listener.until(lambda: localized[-1].data, alive=others)
 
-    # Killed, it begins anew: the robot may be anywhere, and stands.
+    # Killed, it restarts: the robot may be anywhere, and stands.
     os.kill(pilot.pid, signal.SIGKILL)
     pilot.wait(10)
     again = start("pilot", **shared)

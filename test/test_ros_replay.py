@@ -153,9 +153,11 @@ def test_processes_that_are_killed_one_after_the_other_go_on_to_the_same_bit(fol
     out = tmp_path / "out"
     replay(BUNDLED, out, load_configuration(settings=["robot.rate=0.0"]), strike)
     assert not due
-    told = capfd.readouterr().err
+    reported = capfd.readouterr().err
     for name in process_names():
-        assert told.count(f"the node {name} was killed by signal 9: it is started again and goes on where it was") == 2
+        assert (
+            reported.count(f"the node {name} was killed by signal 9: it is started again and goes on where it was") == 2
+        )
     for name in ("trajectory.tum", "trajectory_online.tum", "graph.g2o", "pmf.csv", "map.pgm", "hmt_map/map.bin"):
         assert (out / name).read_bytes() == (folders[1] / name).read_bytes()
     report, undisturbed = (json.loads((folder / "report.json").read_text()) for folder in (out, folders[1]))
@@ -244,24 +246,24 @@ def test_the_live_page_of_a_run_is_served_while_it_lasts_though_it_is_killed_unl
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         url = process.stderr.readline().split()[-1]
 
-        def shown():
+        def read_screen():
             assert process.poll() is None
             with suppress(OSError), urlopen(url + "snapshot.json", timeout=5) as answer:
                 return json.load(answer)
             return {}
 
-        def heard_of(name):
-            rows = shown().get("nodes", ())
+        def received_of(name):
+            rows = read_screen().get("nodes", ())
             return next((row["message"] for row in rows if row["name"] == name), "not heard yet")
 
-        wait_until(lambda: "robot" in shown())
+        wait_until(lambda: "robot" in read_screen())
         nodes = children_of(process.pid)
         os.kill(nodes["robot"], signal.SIGSTOP)
         os.kill(nodes["view"], signal.SIGKILL)
         wait_until(lambda: nodes["view"] not in children_of(process.pid).values())
-        wait_until(lambda: heard_of("rtl") != "not heard yet")
+        wait_until(lambda: received_of("rtl") != "not heard yet")
         os.kill(nodes["robot"], signal.SIGCONT)
-        wait_until(lambda: "robot" in shown())
+        wait_until(lambda: "robot" in read_screen())
         error = process.communicate(timeout=60)[1]
     assert process.returncode == 0
     assert "the node view was killed by signal 9: it is started again" in error

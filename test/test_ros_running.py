@@ -1,4 +1,4 @@
-"""How a node ends when it is told to at an awkward moment."""
+"""How a node ends on request at an awkward moment."""
 
 import ctypes
 import multiprocessing
@@ -24,7 +24,7 @@ def shut_down_while_made():
 
 
 class ToldAtTheBeginning(Node):
-    """A node that is told to end before it is spun, whether its map is then to be saved or not."""
+    """A node that has to end before it is spun, whether its map is then to be saved or not."""
 
     def __init__(self, save_on_shutdown):
         super().__init__("early")

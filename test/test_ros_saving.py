@@ -33,12 +33,12 @@ STATES = {"slam": SlamState, "aam": AamState, "tsbi": TsbiState, "tlca": TlcaSta
 
 
 class Nodes:
-    """The five processes and a robot, and what is heard of them."""
+    """The five processes and a robot, and their messages."""
 
     def __init__(self, start, listener, log, folder, rate, **robot):
         self.listener = listener
-        self.estimates = listener.hear(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
-        self.keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
+        self.estimates = listener.subscribe(String, DOCUMENTS[LocalEstimate], topics.CHAIN)
+        self.keyframes = listener.subscribe(String, KEYFRAMES, topics.CHAIN)
         self.processes = [start(name, save_to=folder) if name == "slam" else start(name) for name in NODES]
         self.robot = start("robot", log=log, robot__rate=rate, **robot)
 
@@ -119,7 +119,7 @@ def test_a_map_is_saved_while_the_robot_drives_and_others_go_on_from_it_when_all
     assert np.abs(at - 4 * 79 * PACE).max() < 0.1
 
 
-def test_nodes_that_are_told_to_end_save_their_map_first_if_that_is_wanted(tmp_path, listener, start):
+def test_nodes_that_have_to_end_save_their_map_first_if_that_is_wanted(tmp_path, listener, start):
     """All at once, twice, and the robot with them, as a launch does that is in a hurry."""
     log, folder = corridor_bag(tmp_path, scans=200), tmp_path / "hmt_map"
     nodes = Nodes(start_with(start, save_on_shutdown=True), listener, log, folder, 4.0)
@@ -146,7 +146,7 @@ def test_nodes_show_a_map_of_the_command_line_at_once_and_go_on_from_it(tmp_path
     log, out = corridor_bag(tmp_path, scans=60), tmp_path / "out"
     command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(out), "--duration", "6"]
     subprocess.run(command, check=True, timeout=120)
-    grids = listener.hear(OccupancyGrid, MAP, topics.LATCHED)
+    grids = listener.subscribe(OccupancyGrid, MAP, topics.LATCHED)
     stayed = start_with(start, start_from=out, start_lost=False)
     nodes = Nodes(stayed, listener, log, tmp_path / "hmt_map", 0.0, robot__start=6.001)
     nodes.until(lambda: grids and nodes.estimates and nodes.last.scan_index == 59)
@@ -161,7 +161,7 @@ def start_with(start, **parameters):
     return lambda name, **own: start(name, **(own if name == "robot" else own | parameters))
 
 
-def test_what_cannot_be_saved_is_told(tmp_path, listener, start):
+def test_what_cannot_be_saved_is_reported(tmp_path, listener, start):
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "notes.txt").write_text("precious")
     start("slam", save_to=tmp_path / "notes")

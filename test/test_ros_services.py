@@ -1,4 +1,4 @@
-"""Services by which the map is asked for, exchanged and forgotten, and mapping pauses, while the nodes run."""
+"""Services by which the map is requested, exchanged and forgotten, and mapping pauses, while the nodes run."""
 
 import re
 import shutil
@@ -29,7 +29,7 @@ TRANSFORMS = {"tf", "tf_static"} if TFMessage else set()
 NAMED = {value for name, value in vars(topics).items() if name.isupper() and isinstance(value, str)}
 MESSAGES = Path(__file__).parent.parent / "docs" / "reference" / "messages.md"
 SAID = {f"/{topic.lstrip('/')}" for topic in {*NAMED, *topics.DOCUMENTS.values(), *TRANSFORMS}} - {
-    *("/initialpose", "/cmd_vel"),  # which are only heard
+    *("/initialpose", "/cmd_vel"),  # which are subscribed to
     "/ground_truth",  # of a robot that is driven
     *("/goal_pose", "/pilot/place_estimate"),  # of explorer and pilot
     "/hmt/notices",  # as there is nothing to complain of
@@ -41,7 +41,7 @@ def corridor(tmp_path_factory):
     return mapped_corridor(tmp_path_factory.mktemp("corridor"))
 
 
-def occupied(grid):
+def count_occupied(grid):
     return int((np.frombuffer(grid.data, dtype=np.int8) == 100).sum())
 
 
@@ -61,7 +61,7 @@ def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corr
     nodes.until(lambda: len(nodes.estimates) == 10)
     nodes.park()
     little = listener.call(GetMap, "tlca/get_map", GetMap.Request()).map
-    assert occupied(little) > 20
+    assert count_occupied(little) > 20
 
     assert load(listener, tmp_path / "nowhere").result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
     shutil.copytree(out / "hmt_map", tmp_path / "damaged")
@@ -70,12 +70,12 @@ def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corr
     nodes.until(lambda: "tlca.json is truncated or damaged" in nodes.diagnosis("slam")["last error"])
     assert nodes.is_localized()
 
-    grids = listener.hear(OccupancyGrid, MAP, topics.LATCHED)
+    grids = listener.subscribe(OccupancyGrid, MAP, topics.LATCHED)
     answer = load(listener, f"file://{out}")
     assert answer.result == LoadMap.Response.RESULT_SUCCESS
-    assert occupied(answer.map) > 2 * occupied(little)
+    assert count_occupied(answer.map) > 2 * count_occupied(little)
     nodes.until(lambda: not nodes.is_localized())
-    nodes.until(lambda: grids and occupied(grids[-1]) == occupied(answer.map))
+    nodes.until(lambda: grids and count_occupied(grids[-1]) == count_occupied(answer.map))
     nodes.drive(log, first=20, rate=8.0)
     nodes.until(nodes.is_localized)
     nodes.until(lambda: last(nodes).scan_index == SCANS + (SCANS - 20) - 1)
@@ -83,13 +83,13 @@ def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corr
     nodes.until(lambda: nodes.poses and np.abs(pose_from_message(nodes.poses[-1].pose.pose) - end).max() < 0.15)
 
 
-def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_that_is_said_can_be_recorded(
+def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_messages_can_be_recorded(
     corridor, listener, start, tmp_path
 ):
     log, out = corridor
     recording = Recording(listener, tmp_path / "bag")
     nodes = Nodes(start, listener, start_from=out, start_lost=False, save_to=tmp_path / "saved")
-    keyframes = listener.hear(String, KEYFRAMES, topics.CHAIN)
+    keyframes = listener.subscribe(String, KEYFRAMES, topics.CHAIN)
     nodes.until(lambda: {m.status[0].name for m in nodes.diagnostics} == {f"/{name}" for name in NODES})
     answer = listener.call(Trigger, "slam/reset", Trigger.Request())
     assert (answer.success, answer.message) == (True, "the map is forgotten, a new one begins")
@@ -101,7 +101,7 @@ def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_that_is_said_
     nodes.until(nodes.is_localized)
     # In the frame of the first scan after it.
     nodes.until(lambda: nodes.poses and abs(pose_from_message(nodes.poses[-1].pose.pose)[0] - 4 * 39 * PACE[0]) < 0.3)
-    assert occupied(listener.call(GetMap, "tlca/get_map", GetMap.Request()).map) > 20
+    assert count_occupied(listener.call(GetMap, "tlca/get_map", GetMap.Request()).map) > 20
     assert listener.call(Trigger, "slam/save", Trigger.Request()).success
     nodes.until(lambda: set(recording.counts) >= SAID)
     recording.close()
@@ -119,8 +119,8 @@ def assert_documented(offered):
         package, name, profile = tables[topic]
         assert kind == f"{package}/msg/{name}", topic
         promised = getattr(topics, profile)
-        for told in profiles:
-            assert (told.reliability, told.durability) == (promised.reliability, promised.durability), topic
+        for reported in profiles:
+            assert (reported.reliability, reported.durability) == (promised.reliability, promised.durability), topic
 
 
 def test_while_paused_scans_are_passed_over_and_odometry_is_not(corridor, listener, start):
@@ -134,13 +134,13 @@ def test_while_paused_scans_are_passed_over_and_odometry_is_not(corridor, listen
 
     def stands():
         """What came before is worked off."""
-        said = nodes.diagnosis("slam")
-        return said["waiting scans"] == "0" and int(said["dropped scans"] or 0) >= 10
+        messages = nodes.diagnosis("slam")
+        return messages["waiting scans"] == "0" and int(messages["dropped scans"] or 0) >= 10
 
     nodes.until(stands)
-    said = len(nodes.estimates)
+    messages = len(nodes.estimates)
     listener.spin(1.0)
-    assert len(nodes.estimates) == said
+    assert len(nodes.estimates) == messages
     nodes.until(lambda: nodes.diagnosis("slam").get("paused", "").startswith("yes"))
     assert listener.call(SetBool, "slam/pause", SetBool.Request(data=False)).success
     # The robot, which waited for an acknowledgement, goes on.

@@ -52,11 +52,11 @@ def let_through(stamps, newest=None):
         ),
     ],
 )
-def test_what_comes_late_or_twice_is_refused_and_time_that_goes_back_is_told_from_it(stamps, expected, refused):
+def test_late_and_repeated_stamps_are_refused_and_time_that_jumps_back_is_not(stamps, expected, refused):
     assert let_through(stamps) == (expected, refused)
 
 
-def test_the_order_goes_on_after_what_was_heard_before_and_what_comes_next_may_be_of_any_time_when_that_is_said():
+def test_the_order_continues_after_earlier_stamps_and_may_restart_at_any_time_on_request():
     assert let_through([4, 5, 6], newest=5) == ([6], 2)
     order = StampOrder(5)
     assert order.push(2, "late") == []
@@ -73,14 +73,14 @@ def test_the_order_goes_on_after_what_was_heard_before_and_what_comes_next_may_b
         pytest.param([1.0, 30.0, 31.0, 32.0, 33.0, 34.0], True, id="the laser, after the node was busy"),
     ],
 )
-def test_a_laser_is_silent_only_where_the_node_could_hear_it(monkeypatch, looks, silent):
+def test_a_laser_is_silent_only_where_the_node_could_receive_it(monkeypatch, looks, silent):
     pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
     from hmt_slam_ros.ros.sensor_input import SensorMonitor  # noqa: PLC0415  only where there is ROS
 
-    said = []
+    messages = []
     monkeypatch.setattr(time, "monotonic", lambda: 0.0)
-    watch = SensorMonitor(SimpleNamespace(warn=said.append))
+    watch = SensorMonitor(SimpleNamespace(warn=messages.append))
     for readings, moment in enumerate(looks, 1):
         monkeypatch.setattr(time, "monotonic", lambda moment=moment: moment)
         watch.check_silence(readings)
-    assert bool(said) == silent
+    assert bool(messages) == silent

@@ -28,13 +28,13 @@ SHUTDOWN = {
     "active": Transition.TRANSITION_ACTIVE_SHUTDOWN,
 }
 LOST, ASKED = 20.0, 3
-"""After so long no answer comes any more, s; and how often a node is asked for its state."""
+"""After so long no answer comes any more, s; and how often the state of a node is requested."""
 
 UP, DOWN = ("rtl", "tsbi", "slam", "aam", "tlca"), ("tlca", "slam", "rtl", "aam", "tsbi")
 
 
 class Manager:
-    """Asks nodes for transitions, as a lifecycle manager does."""
+    """Requests transitions of nodes, as a lifecycle manager does."""
 
     def __init__(self, listener):
         self.listener = listener
@@ -79,14 +79,14 @@ def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_o
     log, saved = corridor_bag(tmp_path, scans=SCANS), tmp_path / "hmt_map"
     manager, nodes = Manager(listener), Nodes(start, listener, autostart=False, save_to=saved, save_on_shutdown=True)
 
-    def said(node):
+    def messages(node):
         return nodes.diagnosis(node)["state"]
 
-    nodes.until(lambda: all(said(name) == "unconfigured" for name in NODES))
+    nodes.until(lambda: all(messages(name) == "unconfigured" for name in NODES))
     assert listener.node.count_subscribers(SCAN) == listener.node.count_publishers(KEYFRAMES) == 0
     nodes.drive(log, first=0, rate=4.0, robot__discovery_timeout=120.0)
     manager.lead(UP, "configure", "inactive")
-    nodes.until(lambda: all(said(name) == "inactive" for name in NODES))
+    nodes.until(lambda: all(messages(name) == "inactive" for name in NODES))
     assert listener.node.count_subscribers(SCAN) == 0
     manager.lead(DOWN, "activate", "active")
     listener.until(lambda: nodes.estimates, seconds=150.0, alive=nodes.alive)  # a first run compiles
@@ -118,7 +118,7 @@ def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_o
     manager.lead(DOWN, "deactivate", "inactive")
     assert listener.call(Trigger, "slam/save", Trigger.Request()).success
     FolderReader(saved, FORMAT, VERSION)
-    begun_anew(manager, nodes, log)
+    restart_all(manager, nodes, log)
     assert estimates_of(nodes, SCANS) == estimates_of(nodes, 0)[:SCANS]
 
     shutil.rmtree(saved)
@@ -127,7 +127,7 @@ def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_o
         assert manager.state(name) == "finalized"
     nodes.until(lambda: listener.node.count_subscribers("hmt/closure_decisions") == 0)
     FolderReader(saved, FORMAT, VERSION)
-    nodes.until(lambda: all(said(name) == "finalized" for name in NODES))
+    nodes.until(lambda: all(messages(name) == "finalized" for name in NODES))
 
 
 def halt(manager, nodes, name):
@@ -138,13 +138,13 @@ def halt(manager, nodes, name):
 
 
 def take_down_and_up(manager, name):
-    """Let an inactive node begin anew; it hears the whole chain once more."""
+    """Let an inactive node restart; it receives the whole chain once more."""
     for transition, state in (("cleanup", "unconfigured"), ("configure", "inactive"), ("activate", "active")):
         manager.lead([name], transition, state)
 
 
 def renew_rtl(manager, nodes):
-    """Let rtl begin anew, until all know of it that it hears odometry and says where the robot is."""
+    """Let rtl restart, until all know of it that it receives odometry and says where the robot is."""
     node = nodes.listener.node
     manager.lead(["rtl"], "deactivate", "inactive")
     manager.lead(["rtl"], "cleanup", "unconfigured")
@@ -155,7 +155,7 @@ def renew_rtl(manager, nodes):
 
 
 def stands(nodes):
-    """Nothing more is said of scans before the end of the log, but for what is on its way."""
+    """Nothing more is reported of scans before the end of the log, but for what is on its way."""
     before = -1
     while before < len(nodes.estimates):
         before = len(nodes.estimates)
@@ -163,8 +163,8 @@ def stands(nodes):
     assert before < SCANS
 
 
-def begun_anew(manager, nodes, log):
-    """Slam alone does not begin anew, all five do."""
+def restart_all(manager, nodes, log):
+    """Slam alone does not restart, all five do."""
     manager.lead(["slam"], "cleanup", "unconfigured")
     assert not manager.change("slam", "configure")
     assert manager.state("slam") == "unconfigured"
@@ -193,12 +193,12 @@ def test_a_node_that_cannot_be_configured_says_why_and_stays(listener, start, tm
 
 
 def test_a_node_that_is_killed_comes_back_in_the_state_in_which_it_was(listener, start, tmp_path):
-    told = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     node = start("rtl", recovery=tmp_path)
     assert Manager(listener).change("rtl", "deactivate")
     node.send_signal(signal.SIGKILL)
     node.communicate()
-    heard = len(told)
+    received = len(reported)
     node = start("rtl", recovery=tmp_path)
-    listener.until(lambda: len(told) > heard, alive=[node])
-    assert told[-1].status[0].message == "inactive"
+    listener.until(lambda: len(reported) > received, alive=[node])
+    assert reported[-1].status[0].message == "inactive"

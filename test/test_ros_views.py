@@ -74,15 +74,15 @@ def snapshot(port):
 
 
 def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(listener, start, browser, screenshots):
-    maps = listener.hear(OccupancyGrid, MAP, topics.LATCHED)
-    graphs = listener.hear(MarkerArray, GRAPH, topics.LATCHED)
-    particles = listener.hear(PoseArray, PARTICLES, topics.STREAM)
-    poses = listener.hear(PoseWithCovarianceStamped, POSE, ALL)
-    local_poses = listener.hear(PoseWithCovarianceStamped, HMT_POSE, ALL)
-    pmfs = listener.hear(Float64MultiArray, PMF, topics.LATCHED)
-    health = listener.hear(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
-    transforms = listener.hear(TFMessage, "tf", ALL) if TFMessage else None
-    finished = listener.hear(String, FINISHED, topics.CHAIN)
+    maps = listener.subscribe(OccupancyGrid, MAP, topics.LATCHED)
+    graphs = listener.subscribe(MarkerArray, GRAPH, topics.LATCHED)
+    particles = listener.subscribe(PoseArray, PARTICLES, topics.STREAM)
+    poses = listener.subscribe(PoseWithCovarianceStamped, POSE, ALL)
+    local_poses = listener.subscribe(PoseWithCovarianceStamped, HMT_POSE, ALL)
+    pmfs = listener.subscribe(Float64MultiArray, PMF, topics.LATCHED)
+    health = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    transforms = listener.subscribe(TFMessage, "tf", ALL) if TFMessage else None
+    finished = listener.subscribe(String, FINISHED, topics.CHAIN)
     port = free_port()
     nodes = [start("view", port=port)]
     page = Page(browser, listener, nodes)
@@ -92,8 +92,8 @@ def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(li
     nodes += [start(name) for name in PROCESSES]
     nodes.append(start("robot", log=BUNDLED, robot__rate=0.0))
     if browser is not None:
-        page.until(lambda: page.drawn.get("robot"))
-        early = page.drawn["robot"]
+        page.until(lambda: page.drawing.get("robot"))
+        early = page.drawing["robot"]
     listener.until(lambda: bool(finished), seconds=120.0, alive=nodes)
     # What tlca draws, every 3 s, may be of before the end.
     listener.until(lambda: maps and graphs and groups_of(graphs[-1])["areas"] >= 3, alive=nodes)
@@ -113,10 +113,10 @@ def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(li
         pytest.skip("the topics are well; the page was not looked at, as there is no browser: apt install chromium")
 
     listener.spin(3.5)  # tlca draws every 3 s
-    page.until(lambda: "ended" in page.text("replay") and page.drawn["map"])
-    page.until(lambda: page.drawn["areas"] == groups_of(graphs[-1])["areas"])
+    page.until(lambda: "ended" in page.text("replay") and page.drawing["map"])
+    page.until(lambda: page.drawing["areas"] == groups_of(graphs[-1])["areas"])
     assert_page(page, port, graphs[-1], pmfs[-1])
-    assert page.drawn["robot"] != early
+    assert page.drawing["robot"] != early
     browser.screenshot(screenshots / "desktop.png")
     assert_that_it_answers_clicks(page, snapshot(port)["graph"])
     browser.dark(True)
@@ -150,11 +150,11 @@ def assert_graph(graph):
 
 
 def assert_health(health):
-    told = {status.name.strip("/"): {v.key: v.value for v in status.values} for a in health for status in a.status}
-    assert set(told) == {*PROCESSES, "robot", "view"}
-    assert {"memory", "peak memory", "busy", "last error"} <= set.intersection(*map(set, told.values()))
-    assert float(told["slam"]["effective samples"].removesuffix(" of 12")) >= 1.0
-    assert float(told["slam"]["memory"].removesuffix(" MB")) > 20.0
+    reported = {status.name.strip("/"): {v.key: v.value for v in status.values} for a in health for status in a.status}
+    assert set(reported) == {*PROCESSES, "robot", "view"}
+    assert {"memory", "peak memory", "busy", "last error"} <= set.intersection(*map(set, reported.values()))
+    assert float(reported["slam"]["effective samples"].removesuffix(" of 12")) >= 1.0
+    assert float(reported["slam"]["memory"].removesuffix(" MB")) > 20.0
     values = [value for array in health for status in array.status for value in status.values]
     assert max(float(value.value) for value in values if value.key == "sent Scan a second") > 1.0
 
@@ -169,22 +169,22 @@ def open_before_anything_runs(page, port):
 
 def assert_page(page, port, graph, pmf):
     """The page shows what the topics say."""
-    drawn, known, groups = page.drawn, snapshot(port), groups_of(graph)
+    drawn, known, groups = page.drawing, snapshot(port), groups_of(graph)
     assert drawn["areas"] == groups["areas"]
     assert drawn["arcs"] == groups["arcs"] + groups["closures"]
     assert drawn["closures"] == groups["closures"]
-    leaves = zip(*[iter(pmf.data)] * 3, strict=True)
-    rows = [(hypothesis, area) for hypothesis, area, _ in leaves if hypothesis >= 0]
+    hypotheses = zip(*[iter(pmf.data)] * 3, strict=True)
+    rows = [(hypothesis, area) for hypothesis, area, _ in hypotheses if hypothesis >= 0]
     assert drawn["bars"] == len(rows)
-    assert [tuple(leaf[:2]) for leaf in known["history"]["events"][-1]["hypotheses"]] == rows
+    assert [tuple(child[:2]) for child in known["history"]["events"][-1]["hypotheses"]] == rows
     assert drawn["events"] == len(known["history"]["events"]) > 50
     assert drawn["robot"] == known["robot"]["pose"]
     assert page.text("position").startswith(f"{drawn['robot'][0]:.2f}")
     assert all(name in page.text("nodes") for name in (*PROCESSES, "robot", "view"))
     assert "samples" in page.text("nodes")
     assert page.text("silent") == "all were heard"
-    assert page.colours("plan") > 50
-    assert page.colours("course") >= 2
+    assert page.colors("plan") > 50
+    assert page.colors("course") >= 2
     assert page.sideways == 0
 
 
@@ -192,31 +192,31 @@ def assert_that_it_answers_clicks(page, graph):
     """A click on an area says how certain its place is; the robot can be followed, and the whole map be seen again."""
     evaluate = page.browser.evaluate
     area = graph["areas"][-1]
-    spot = next(drawn["at"] for drawn in page.drawn["spots"] if drawn["area"] == area["area"])
+    spot = next(drawn["at"] for drawn in page.drawing["spots"] if drawn["area"] == area["area"])
     left, top = evaluate("(({left, top}) => [left, top])(document.getElementById('plan').getBoundingClientRect())")
     page.click(left + spot[0], top + spot[1])
     page.until(lambda: page.text("hint") == area["text"])
     assert "±" in area["text"]
     evaluate("document.getElementById('follow').click()")
-    page.until(lambda: page.drawn["middle"] == page.drawn["robot"][:2])
+    page.until(lambda: page.drawing["middle"] == page.drawing["robot"][:2])
     evaluate("document.getElementById('fit').click()")
-    page.until(lambda: page.drawn["middle"] != page.drawn["robot"][:2])
+    page.until(lambda: page.drawing["middle"] != page.drawing["robot"][:2])
 
 
 def assert_phone(page, screenshots):
     page.browser.size(*PHONE, mobile=True, ratio=2.0)
     page.until(lambda: page.browser.evaluate("document.getElementById('plan').clientWidth") == PHONE[0])
-    page.until(lambda: page.colours("plan") > 50)
+    page.until(lambda: page.colors("plan") > 50)
     assert page.sideways == 0
     page.browser.screenshot(screenshots / "phone.png", whole=True)
-    before = spread(page.drawn["spots"])
+    before = spread(page.drawing["spots"])
     page.pinch(PHONE[0] / 2, 300.0, before=100.0, after=200.0)
-    page.until(lambda: spread(page.drawn["spots"]) == pytest.approx(2.0 * before, rel=0.1))
+    page.until(lambda: spread(page.drawing["spots"]) == pytest.approx(2.0 * before, rel=0.1))
 
 
-def spread(spots):
+def spread(positions):
     """Pixels between the first and the last area."""
-    return np.hypot(*np.subtract(spots[0]["at"], spots[-1]["at"]))
+    return np.hypot(*np.subtract(positions[0]["at"], positions[-1]["at"]))
 
 
 def test_an_arc_that_could_be_any_has_no_ellipse():

@@ -98,7 +98,7 @@ def notebook(**changes):
     return Notebook(**content | changes)
 
 
-def written(directory, document=None, version=3):
+def write_folder(directory, document=None, version=3):
     writer = FolderWriter(directory)
     document = document or notebook()
     writer.write("notes", document)
@@ -117,7 +117,7 @@ def files(directory):
 
 
 def test_everything_comes_back_bit_for_bit_and_can_be_written_to(tmp_path):
-    found = read(written(tmp_path / "book"))
+    found = read(write_folder(tmp_path / "book"))
     wanted = notebook()
     assert list(found.places) == ["b", "a"]
     for name, place in wanted.places.items():
@@ -139,7 +139,7 @@ def test_everything_comes_back_bit_for_bit_and_can_be_written_to(tmp_path):
 
 
 def test_a_scan_is_one_object_in_all_documents_and_two_of_one_stamp_stay_two(tmp_path):
-    folder = FolderReader(written(tmp_path / "book"), "book", 3)
+    folder = FolderReader(write_folder(tmp_path / "book"), "book", 3)
     one, two = folder.read("notes", Notebook), folder.read("more", Notebook)
     assert one.scans[0] is one.scans[2] is two.scans[0]
     assert one.scans[1] is two.scans[1] is not one.scans[0]
@@ -147,14 +147,14 @@ def test_a_scan_is_one_object_in_all_documents_and_two_of_one_stamp_stay_two(tmp
 
 
 def test_the_same_content_gives_the_same_bytes_and_what_is_read_gives_them_again(tmp_path):
-    first, again = written(tmp_path / "first"), written(tmp_path / "again")
+    first, again = write_folder(tmp_path / "first"), write_folder(tmp_path / "again")
     assert files(first) == files(again)
-    assert files(written(tmp_path / "copy", read(first))) == files(first)
+    assert files(write_folder(tmp_path / "copy", read(first))) == files(first)
 
 
 @pytest.mark.parametrize("name", ["notes.json", "notes.bin", "more.json", "scans.bin", "scans.json", "words.txt"])
 def test_a_file_that_is_missing_cut_or_changed_is_named(tmp_path, name):
-    path = written(tmp_path / "book") / name
+    path = write_folder(tmp_path / "book") / name
     whole = path.read_bytes()
     path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
     with pytest.raises(HmtSlamError, match=rf"{name} is damaged, its SHA-256 is not that of manifest\.json: take a"):
@@ -169,7 +169,7 @@ def test_a_file_that_is_missing_cut_or_changed_is_named(tmp_path, name):
 
 
 def test_any_changed_character_of_the_manifest_is_noticed(tmp_path):
-    path = written(tmp_path / "book") / "manifest.json"
+    path = write_folder(tmp_path / "book") / "manifest.json"
     whole = path.read_text()
     for place in range(len(whole)):
         if whole[place].isalnum():
@@ -181,7 +181,7 @@ def test_any_changed_character_of_the_manifest_is_noticed(tmp_path):
 
 
 def test_what_else_a_manifest_can_be_has_its_sentence(tmp_path):
-    path = written(tmp_path / "book") / "manifest.json"
+    path = write_folder(tmp_path / "book") / "manifest.json"
     whole = path.read_text()
     with pytest.raises(HmtSlamError, match="is a book of version 3, this program reads version 4: map the log again"):
         read(tmp_path / "book", version=4)
@@ -220,7 +220,7 @@ def test_what_else_a_manifest_can_be_has_its_sentence(tmp_path):
 )
 def test_a_document_of_another_form_is_refused_by_name(tmp_path, change, sentence):
     with pytest.raises(HmtSlamError, match=sentence):
-        read(written(tmp_path / "book", notebook(**change)))
+        read(write_folder(tmp_path / "book", notebook(**change)))
 
 
 def test_an_array_beyond_its_file_and_a_key_that_comes_twice_are_refused(tmp_path):
@@ -282,7 +282,7 @@ while True:
 
 def test_whenever_a_saving_process_is_killed_there_is_a_whole_map(tmp_path):
     """It saves again and again, and is killed at moments spread over what saving once takes."""
-    target = written(tmp_path / "book")
+    target = write_folder(tmp_path / "book")
     for round_ in range(5):
         command = [sys.executable, "-c", _SAVER, str(target), str(Path(__file__).parent)]
         environment = dict(os.environ) | {"PYTHONPATH": os.pathsep.join(sys.path)}
@@ -301,7 +301,7 @@ def test_whenever_a_saving_process_is_killed_there_is_a_whole_map(tmp_path):
 
 
 def test_json_of_a_document_is_one_line_that_any_program_reads(tmp_path):
-    directory = written(tmp_path / "book")
+    directory = write_folder(tmp_path / "book")
     content = json.loads((directory / "notes.json").read_text())
     entry = content["places"][1][1]["pose"]
     array = np.fromfile(directory / "notes.bin", entry["type"], int(np.prod(entry["shape"])), offset=entry["at"])

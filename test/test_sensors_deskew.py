@@ -102,7 +102,7 @@ def steady(*stamps):
 
 
 @pytest.mark.parametrize(
-    ("stamps", "start", "end", "travelled"),
+    ("stamps", "start", "end", "traveled"),
     [
         ((0, 20, 40, 60, 80, 100), 10, 90, 0.08),
         ((0, 100), 0, 100, 0.1),
@@ -114,10 +114,10 @@ def steady(*stamps):
         ((), 0, 100, 0.0),
     ],
 )
-def test_motion_is_interpolated_and_goes_on_for_a_while_after_the_last_reading(stamps, start, end, travelled):
+def test_motion_is_interpolated_and_goes_on_for_a_while_after_the_last_reading(stamps, start, end, traveled):
     buffer = steady(*stamps)
     buffer.pose_at(start * MS)
-    np.testing.assert_allclose(buffer.twist_between(start * MS, end * MS), (travelled, 0.0, 0.0), atol=1e-12)
+    np.testing.assert_allclose(buffer.twist_between(start * MS, end * MS), (traveled, 0.0, 0.0), atol=1e-12)
 
 
 def blank(stamp, increment, beams=101):
@@ -133,14 +133,14 @@ def blank(stamp, increment, beams=101):
         (0.05, "its 101 beams would take 5.00 s, more than 1 s"),
     ],
 )
-def test_an_impossible_time_increment_is_told_and_left_out(increment, sentence):
+def test_an_impossible_time_increment_is_reported_and_left_out(increment, sentence):
     scan, fault = SweepCheck().check(blank(7, increment))
     assert scan.time_increment == 0.0
     assert scan.end_stamp == 7
     assert sentence in fault
 
 
-def test_a_sweep_longer_than_the_time_between_scans_is_told_once_that_time_is_known():
+def test_a_sweep_longer_than_the_time_between_scans_is_reported_once_that_time_is_known():
     check = SweepCheck()
     verdicts = [check.check(blank(50 * k * MS, 0.001)) for k in range(10)]
     assert [fault is None for _, fault in verdicts] == [True] * 5 + [False] * 5

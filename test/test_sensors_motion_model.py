@@ -38,7 +38,7 @@ def test_odometry_is_unknown_before_the_first_reading_and_after_the_last():
     assert not buffer.covers(11)
 
 
-def test_odometry_whose_stamps_jump_back_starts_anew():
+def test_odometry_whose_stamps_jump_back_restarts():
     buffer = OdometryBuffer()
     buffer.add(Odometry(1000, np.array([5.0, 0.0, 0.0])))
     buffer.add(Odometry(10, np.zeros(3)))
@@ -46,7 +46,7 @@ def test_odometry_whose_stamps_jump_back_starts_anew():
     np.testing.assert_allclose(buffer.pose_at(15)[0], [0.5, 0.0, 0.0])
 
 
-def driven(inertia, velocity, times):
+def drive_steadily(inertia, velocity, times):
     """Let the robot go on at a steady velocity, scans at these times; the last prediction and the truth."""
     prediction = truth = None
     for seconds, step in zip(np.diff(times), np.full(len(times) - 1, times[-1] / (len(times) - 1)), strict=True):
@@ -62,7 +62,7 @@ def deviations(step, truth):
 
 
 def test_a_steady_velocity_is_learnt():
-    prediction, truth = driven(Inertia(MotionParameters()), TURNING, 0.2 * np.arange(20))
+    prediction, truth = drive_steadily(Inertia(MotionParameters()), TURNING, 0.2 * np.arange(20))
     np.testing.assert_allclose(prediction.increment, truth, atol=0.01)
     assert deviations(prediction, truth) < 0.3
     assert np.sqrt(np.diag(prediction.covariance))[0] < 0.05
@@ -83,7 +83,7 @@ def test_scans_whose_stamps_come_in_bursts_are_predicted_as_evenly_taken_within_
 
 def test_where_scans_do_not_show_the_motion_the_velocity_becomes_uncertain():
     inertia = Inertia(MotionParameters())
-    driven(inertia, np.array([0.5, 0.0, 0.0]), 0.2 * np.arange(20))
+    drive_steadily(inertia, np.array([0.5, 0.0, 0.0]), 0.2 * np.arange(20))
     spreads = []
     for _ in range(10):
         step = inertia.predict(0.2)
@@ -95,9 +95,9 @@ def test_where_scans_do_not_show_the_motion_the_velocity_becomes_uncertain():
     assert across[-1] < 1.2 * across[0]
 
 
-def test_a_jump_says_nothing_of_the_velocity_and_a_velocity_that_lasts_is_learnt_at_once():
+def test_a_jump_has_no_information_on_the_velocity_and_a_velocity_that_lasts_is_learnt_at_once():
     inertia = Inertia(MotionParameters())
-    driven(inertia, np.array([0.3, 0.0, 0.0]), 0.2 * np.arange(20))
+    drive_steadily(inertia, np.array([0.3, 0.0, 0.0]), 0.2 * np.arange(20))
     inertia.predict(0.2)
     inertia.observe(se2.exp([0.3, -0.9, -1.0]), SHARP)
     after = inertia.predict(0.2)
@@ -110,13 +110,13 @@ def test_a_jump_says_nothing_of_the_velocity_and_a_velocity_that_lasts_is_learnt
 
 def test_after_a_long_pause_the_robot_is_not_believed_to_have_turned_on_and_on():
     inertia = Inertia(MotionParameters())
-    driven(inertia, np.array([0.0, 0.0, np.radians(-60.0)]), 0.2 * np.arange(20))
+    drive_steadily(inertia, np.array([0.0, 0.0, np.radians(-60.0)]), 0.2 * np.arange(20))
     step = inertia.predict(6.0)
     assert np.degrees(step.increment[2]) > -65.0
     assert np.degrees(np.sqrt(step.covariance[2, 2])) > 60.0
 
 
-def learnt(factor, steps=400, slips=()):
+def learn_noise(factor, steps=400, slips=()):
     """The noise learnt from odometry with ``factor`` times the model's noise; at ``slips`` 20 degrees on top."""
     random = np.random.default_rng(0)
     noise, motion = OdometryNoise(), MotionParameters()
@@ -131,15 +131,15 @@ def learnt(factor, steps=400, slips=()):
 
 @pytest.mark.parametrize("factor", [1.0, 2.0, 4.0])
 def test_the_noise_of_odometry_is_learnt(factor):
-    np.testing.assert_allclose(learnt(factor).factors, factor, rtol=0.25)
+    np.testing.assert_allclose(learn_noise(factor).factors, factor, rtol=0.25)
 
 
 def test_odometry_better_than_its_model_is_taken_as_the_model_says():
-    np.testing.assert_array_equal(learnt(0.3).factors, 1.0)
+    np.testing.assert_array_equal(learn_noise(0.3).factors, 1.0)
     step, inertia = RelativeMotion(TURNING, np.diag([1.0, 2.0, 3.0])), RelativeMotion(np.zeros(3), 1e-6 * np.eye(3))
-    for said in (learnt(0.3).scale(step), learnt(0.3).fuse(step, inertia)):
-        np.testing.assert_array_equal(said.increment, step.increment)
-        np.testing.assert_array_equal(said.covariance, step.covariance)
+    for messages in (learn_noise(0.3).scale(step), learn_noise(0.3).fuse(step, inertia)):
+        np.testing.assert_array_equal(messages.increment, step.increment)
+        np.testing.assert_array_equal(messages.covariance, step.covariance)
 
 
 def test_inertia_reduces_noise_beyond_twice_the_models_and_no_more():
@@ -147,17 +147,17 @@ def test_inertia_reduces_noise_beyond_twice_the_models_and_no_more():
         RelativeMotion(np.array([0.1, 0.0, 0.0]), 1e-4 * np.eye(3)),
         RelativeMotion(np.zeros(3), 1e-12 * np.eye(3)),
     )
-    both = learnt(4.0).fuse(step, inertia)
+    both = learn_noise(4.0).fuse(step, inertia)
     np.testing.assert_allclose(both.increment, 0.0, atol=1e-3)
     np.testing.assert_allclose(both.covariance, 4.0 * step.covariance, rtol=1e-3, atol=1e-9)
 
 
 def test_a_slip_is_not_taken_for_noise():
-    assert learnt(1.0, slips=(399,)).factors[1] < 1.6
-    assert learnt(1.0, slips=(200,)).factors[1] < 1.3
+    assert learn_noise(1.0, slips=(399,)).factors[1] < 1.6
+    assert learn_noise(1.0, slips=(200,)).factors[1] < 1.3
 
 
-def test_what_scans_do_not_show_says_nothing_of_the_noise():
+def test_what_scans_do_not_show_has_no_information_on_the_noise():
     noise = OdometryNoise()
     covariance = np.diag([0.01, 0.01, 0.001])
     for _ in range(100):
@@ -171,16 +171,16 @@ def test_odometry_predicts_where_readings_enclose_both_scans_and_inertia_elsewhe
     model = MotionModel(MotionParameters())
     for k in (0, 1, 2, 6, 7):
         model.odometry.add(Odometry(k * SECOND // 10, np.array([0.05 * k, 0.0, 0.0])))
-    said = [model.predict(k * SECOND // 10).odometry for k in range(10)]
-    assert [step is None for step in said] == [True] + 7 * [False] + 2 * [True]
-    for step in said[1:8]:
+    messages = [model.predict(k * SECOND // 10).odometry for k in range(10)]
+    assert [step is None for step in messages] == [True] + 7 * [False] + 2 * [True]
+    for step in messages[1:8]:
         np.testing.assert_allclose(step.increment, [0.05, 0.0, 0.0], atol=1e-12)
     # Between readings 0.4 s apart the robot may have sped up and braked.
-    assert said[4].covariance[0, 0] > said[1].covariance[0, 0]
-    assert said[7].covariance[0, 0] == pytest.approx(said[1].covariance[0, 0])
+    assert messages[4].covariance[0, 0] > messages[1].covariance[0, 0]
+    assert messages[7].covariance[0, 0] == pytest.approx(messages[1].covariance[0, 0])
 
 
-def test_where_odometry_is_silent_its_pose_is_carried_on_by_the_match():
+def test_where_odometry_is_silent_its_pose_is_extrapolated_by_the_match():
     model = MotionModel(MotionParameters())
     model.odometry.add(Odometry(0, np.array([3.0, 0.0, 0.0])))
     for k in range(4):
@@ -207,7 +207,7 @@ def test_noisy_odometry_and_inertia_together_tell_the_motion_better_where_no_sca
     assert (np.sqrt((late**2).mean(axis=0)) < 0.6 * noise).all()
 
 
-def test_odometry_that_the_scans_contradict_says_nothing_of_the_velocity():
+def test_odometry_that_the_scans_contradict_has_no_information_on_the_velocity():
     models = [MotionModel(MotionParameters()), MotionModel(MotionParameters())]
     for k in range(20):
         for model in models:

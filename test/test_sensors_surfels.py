@@ -12,7 +12,7 @@ CORRIDOR = np.array([[-100.0, -1.1, 100.0, -1.1], [-100.0, 1.1, 100.0, 1.1]])
 ROOM = box(-3, -2, 5, 4)
 
 
-def seen(walls, pose, stride=1, **settings):
+def world_surfels(walls, pose, stride=1, **settings):
     """Surfels in the world, of beams up to the reach."""
     scan = scan_in(walls, pose, **settings)
     near = np.hypot(*scan.points.T) < REACH
@@ -27,7 +27,7 @@ def flat(found):
 
 @pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (3.0, 0.5, 0.1), (-2.0, -0.4, 3.0)])
 def test_all_points_of_a_corridor_face_across_it_also_those_that_beams_hardly_meet(pose):
-    found = seen(CORRIDOR, pose, beams=361, field_of_view=2 * np.pi)
+    found = world_surfels(CORRIDOR, pose, beams=361, field_of_view=2 * np.pi)
     assert len(flat(found)) == len(found)
     np.testing.assert_allclose(np.abs(found[:, 3]), 1.0, atol=1e-6)
 
@@ -36,7 +36,7 @@ def test_all_points_of_a_corridor_face_across_it_also_those_that_beams_hardly_me
 def test_noise_turns_normals_neither_forwards_nor_backwards(noise):
     turns = []
     for seed in range(300):
-        found = seen(CORRIDOR, (0.0, 0.2 * np.sin(seed), 0.05), noise=noise, seed=seed)
+        found = world_surfels(CORRIDOR, (0.0, 0.2 * np.sin(seed), 0.05), noise=noise, seed=seed)
         outward = found[:, 2] * np.sign(found[:, 3]) * np.sign(found[:, 1])
         turns.append(outward[np.abs(found[:, 0]) < 3.0].mean())
     # Total least squares would turn them by 0.0005 and 0.0045.
@@ -55,7 +55,7 @@ def test_the_error_of_a_point_is_not_that_of_its_normal():
 
 
 def test_at_a_corner_each_point_belongs_to_its_own_wall():
-    found = seen(ROOM, (0.0, 0.0, 0.0), beams=721, field_of_view=2 * np.pi)
+    found = world_surfels(ROOM, (0.0, 0.0, 0.0), beams=721, field_of_view=2 * np.pi)
     x, _, normal_x, normal_y = found[np.hypot(found[:, 0] - 5.0, found[:, 1] - 4.0) < 0.4].T
     assert len(x) > 10
     on_x_wall = np.abs(x - 5.0) < 1e-5
@@ -64,7 +64,7 @@ def test_at_a_corner_each_point_belongs_to_its_own_wall():
 
 
 def test_a_post_has_no_normal_and_stays():
-    found = seen(np.concatenate((ROOM, box(1.99, 0.99, 2.01, 1.01))), (0.0, 0.0, 0.0), beams=361)
+    found = world_surfels(np.concatenate((ROOM, box(1.99, 0.99, 2.01, 1.01))), (0.0, 0.0, 0.0), beams=361)
     post = found[np.hypot(found[:, 0] - 2.0, found[:, 1] - 1.0) < 0.1]
     assert len(post)
     np.testing.assert_array_equal(post[:, 2:], 0.0)
@@ -80,12 +80,12 @@ def test_a_point_that_only_shows_where_a_shadow_ends_is_left_out():
     scan = scan_in(walls, (0.0, 0.0, 0.0))
     backs = np.abs(scan.points[:, 1] - 1.3) < 1e-5
     assert backs.sum() == 1
-    found = seen(walls, (0.0, 0.0, 0.0))
+    found = world_surfels(walls, (0.0, 0.0, 0.0))
     assert not (np.abs(found[:, 1] - 1.3) < 1e-5).any()
 
 
 def test_thinning_leaves_the_normals_as_they_are():
-    every, third = (seen(ROOM, (0.0, 0.0, 0.3), stride, noise=0.01) for stride in (1, 3))
+    every, third = (world_surfels(ROOM, (0.0, 0.0, 0.3), stride, noise=0.01) for stride in (1, 3))
     places = {tuple(surfel[:2]): surfel for surfel in every}
     assert len(every) // 4 < len(third) <= -(-181 // 3)
     for surfel in third:
@@ -101,7 +101,7 @@ def test_few_points_have_no_normals(count):
 
 
 def test_moved_surfels_turn_with_the_frame():
-    found = seen(ROOM, (0.0, 0.0, 0.0))
+    found = world_surfels(ROOM, (0.0, 0.0, 0.0))
     there = transform_surfels(np.array([1.0, 2.0, np.pi / 2]), found)
     np.testing.assert_allclose(there[:, :2], se2.transform((1.0, 2.0, np.pi / 2), found[:, :2]))
     np.testing.assert_allclose(there[:, 2:], np.stack((-found[:, 3], found[:, 2]), axis=1), atol=1e-12)

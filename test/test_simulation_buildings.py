@@ -70,7 +70,7 @@ def test_another_seed_is_another_building(family):
     assert lengths[0].size != lengths[1].size or np.abs(lengths[0] - lengths[1]).max() > 0.01
 
 
-def test_the_largest_nested_loops_asked_for_are_two_kilometres_long():
+def test_the_largest_nested_loops_requested_are_two_kilometers_long():
     assert 1900.0 < scenario_of("nested", size=4).drive.path.lengths.sum() < 2600.0
 
 
@@ -154,7 +154,7 @@ def test_the_twins_are_alike_as_far_as_the_laser_sees_and_the_passage_behind_the
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_after_the_tour_of_the_hall_odometry_cannot_tell_the_twins_apart(seed):
+def test_after_the_tour_of_the_hall_odometry_cannot_separate_the_twins(seed):
     """From the last wall that is seen to the next, the deviation across is more than from room to room."""
     scenario = scenario_of("twins", seed, dropout=0)
     first, second = scenario.building.twin_frames["first"], scenario.building.twin_frames["second"]

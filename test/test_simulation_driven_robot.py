@@ -1,4 +1,4 @@
-"""A robot that is driven by commands goes where it is told to, measures as the scripted one, and stops at obstacles."""
+"""A robot that is driven by commands goes where commands lead, measures as the scripted one, and stops at obstacles."""
 
 import math
 
@@ -39,7 +39,7 @@ def test_it_begins_where_the_scripted_drive_does_and_sees_the_same():
     np.testing.assert_array_equal(reading.pose, scenario.odometry[0])
 
 
-def test_it_follows_an_exact_arc_once_it_is_as_fast_as_told():
+def test_it_follows_an_exact_arc_once_it_is_as_fast_as_requested():
     robot = robot_in(odometry=0.0, start=np.array([0.0, -1.0, 0.0]))
     drive(robot, 0.4, 0.3, 15)
     assert robot.velocity == pytest.approx((0.4, 0.3))
@@ -182,7 +182,7 @@ def test_odometry_between_scans_grows_evenly_on_an_even_way():
     assert np.abs(errors[-1]).max() > 1e-3
 
 
-def test_wheels_do_not_notice_that_it_is_carried():
+def test_wheels_do_not_notice_that_it_is_kidnapped():
     robot = robot_in(odometry=0.0, readings=2)
     drive(robot, 0.3, 0.1, 11)
     before, wheels = robot.pose, robot.measure()[0].pose

@@ -25,7 +25,7 @@ def test_the_way_begins_and_ends_at_its_way_points_and_goes_on_without_a_jump():
     np.testing.assert_allclose(se2.between(ends[:-1], path.starts[1:]), 0.0, atol=1e-12)
 
 
-def test_corners_are_rounded_by_arcs_of_the_radius_asked_for_or_smaller_where_there_is_no_room():
+def test_corners_are_rounded_by_arcs_of_the_radius_requested_or_smaller_where_there_is_no_room():
     path = path_through(CORNERS, 0.5)
     arcs = ~path.is_turn_in_place & (path.turns != 0.0)
     radii = path.lengths[arcs] / np.abs(path.turns[arcs])

@@ -16,13 +16,13 @@ def scenario_of(seed=0, **settings):
     return open_simulated(f"sim:institute,seed={seed}{words}").scenario
 
 
-def ahead(scenario, poses, reach=30.0):
+def distance_ahead(scenario, poses, reach=30.0):
     """How far it is to the next wall ahead of poses (n, 3), m."""
     return cast_rays(scenario.walls, np.ascontiguousarray(poses[:, :2]), np.ascontiguousarray(poses[:, 2]), reach)
 
 
 def open_doors(scenario):
-    """The middles of the doors in the frame of the hallways, to the centimetre."""
+    """The middles of the doors in the frame of the hallways, to the centimeter."""
     crossings = scenario.building.states.poses[scenario.building.states.crossings]
     frame = np.array([*crossings[:2, :2].mean(axis=0), crossings[0, 2]])
     doors = scenario.building.doors
@@ -42,18 +42,18 @@ def test_there_are_four_crossings_and_nine_open_rooms_apart_from_each_other(seed
 
 @pytest.mark.parametrize("visit", [0, 1])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_openings_are_as_wide_as_is_said_and_lead_somewhere(seed, visit):
+def test_openings_are_as_wide_as_stated_and_lead_somewhere(seed, visit):
     scenario = scenario_of(seed, visit=visit)
     states = scenario.building.states
     openings = states.openings
     # From the middle of the opening, just behind the line of the hallway's side, to both jambs.
     for turn in (0.5 * np.pi, -0.5 * np.pi):
         np.testing.assert_allclose(
-            ahead(scenario, se2.compose(openings, np.array([0.02, 0.0, turn]))), 0.5 * states.widths, atol=1e-3
+            distance_ahead(scenario, se2.compose(openings, np.array([0.02, 0.0, turn]))), 0.5 * states.widths, atol=1e-3
         )
-    assert (ahead(scenario, openings) > 1.5).all()
+    assert (distance_ahead(scenario, openings) > 1.5).all()
     # The pose is in the middle of its hallway: both ways across a hallway without an opening are as long.
-    back = ahead(scenario, se2.compose(states.poses, np.array([0.0, 0.0, np.pi])))
+    back = distance_ahead(scenario, se2.compose(states.poses, np.array([0.0, 0.0, np.pi])))
     assert (back >= states.ahead - 1e-3).all()
     np.testing.assert_allclose(back[states.crossings], states.ahead[states.crossings], atol=0.1)
 
@@ -75,7 +75,7 @@ def test_both_hallways_are_driven_from_end_to_end(seed):
     states, way = scenario.building.states, scenario.poses
     for pose in states.poses[states.crossings][::2]:
         hallway = se2.compose(pose, np.array([0.0, 0.0, -0.5 * np.pi]))
-        ends = ahead(scenario, np.array([hallway, se2.compose(hallway, [0.0, 0.0, np.pi])]), 60.0)
+        ends = distance_ahead(scenario, np.array([hallway, se2.compose(hallway, [0.0, 0.0, np.pi])]), 60.0)
         assert ends.sum() == pytest.approx(50.0)
         along, across = se2.transform(se2.inverse(hallway), way[:, :2]).T
         driven = along[np.abs(across) < 0.2]
@@ -83,7 +83,7 @@ def test_both_hallways_are_driven_from_end_to_end(seed):
         assert driven.min() < -ends[1] + 1.1
 
 
-def test_the_floor_is_fifty_by_twenty_five_metres():
+def test_the_floor_is_fifty_by_twenty_five_meters():
     for seed in SEEDS:
         scenario = scenario_of(seed)
         crossings = scenario.building.states.poses[:2]

@@ -107,7 +107,7 @@ def test_a_bag_of_a_real_robot_knows_no_truth():
         read_true_poses(log)
 
 
-def test_truth_is_told_of_any_time_and_of_places():
+def test_truth_is_known_at_any_time_and_for_places():
     log = open_log("sim:ring,odometry=0,seed=2")
     assert isinstance(log, SimulatedLog)
     truth, odometry = read_true_poses(log), read_odometry_poses(log)
@@ -124,7 +124,7 @@ def test_truth_is_told_of_any_time_and_of_places():
     assert same[half + 3 :, : half - 3].any(axis=1).mean() > 0.9
 
 
-def test_true_relations_reach_to_the_next_metre_the_tenth_and_the_lap_before():
+def test_true_relations_reach_to_the_next_meter_the_tenth_and_the_lap_before():
     truth = read_true_poses(open_log("sim:ring,seed=1"))
     relations = true_relations(truth)
     long = np.abs(relations.ends - relations.starts) > 60_000_000_000
@@ -217,7 +217,7 @@ def test_the_map_that_a_run_leaves_can_be_driven_through(tmp_path):
     subprocess.run([*command, "map", MALAGA, "--out", tmp_path / "out", "--duration", "10"], check=True, timeout=300)
     path = read_tum(tmp_path / "out" / "trajectory.tum").poses
     world = yaml.safe_load((tmp_path / "out" / "map.yaml").read_text())
-    # The robot stands for a while first, and millimetres of a route would turn it anywhere.
+    # The robot stands for a while first, and millimeters of a route would turn it anywhere.
     way = path[np.hypot(path[:, 0], path[:, 1]) > 0.05]
     world["route"] = way[:: len(way) // 6, :2].tolist()
     (tmp_path / "out" / "world.yaml").write_text(yaml.safe_dump(world))
@@ -229,9 +229,9 @@ def test_the_map_that_a_run_leaves_can_be_driven_through(tmp_path):
 def test_simulate_writes_bag_and_truth_and_evaluate_takes_either(tmp_path):
     command = [sys.executable, "-m", "hmt_slam_ros.cli.main"]
     words = ["simulate", "ring", "--seed", "3", "--set", "laps=1", "--duration", "20", "--out", tmp_path / "bag"]
-    said = subprocess.run([*command, *words], capture_output=True, text=True, check=True, timeout=120).stdout
-    assert "101 scans, 20.0 s" in said
-    assert "sim:ring,laps=1,seed=3" in said
+    sent = subprocess.run([*command, *words], capture_output=True, text=True, check=True, timeout=120).stdout
+    assert "101 scans, 20.0 s" in sent
+    assert "sim:ring,laps=1,seed=3" in sent
     log = open_log("sim:ring,laps=1,seed=3", duration=20.0)
     truth = read_tum(tmp_path / "bag" / "ground_truth.tum")
     assert np.array_equal(truth.stamps, read_true_poses(log).stamps)

@@ -37,7 +37,7 @@ def test_end_points_lie_on_the_walls_whatever_the_field_of_view(field_of_view, b
     assert math.degrees(angles[-1] - angles[0]) == pytest.approx(min(field_of_view, 359.0), abs=1e-3)
 
 
-def test_noise_and_dropout_are_what_was_asked_for():
+def test_noise_and_dropout_are_as_requested():
     scans = [in_room(range_noise=0.03, dropout=0.05).scan(k) for k in range(40)]
     truth = [noiseless().scan(k) for k in range(40)]
     valid = np.concatenate([scan.valid for scan in scans])

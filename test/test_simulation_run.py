@@ -22,17 +22,17 @@ def hmt_slam(*arguments):
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory):
+def mapped_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "out"
-    said = hmt_slam("map", LOG, "--out", folder)
-    return folder, said
+    messages = hmt_slam("map", LOG, "--out", folder)
+    return folder, messages
 
 
-def test_a_small_loop_is_closed_and_mapped_to_two_centimetres(mapped):
-    """Two laps of 45 m: the mean error of relations to the next metres, and to where the robot was a lap before."""
-    folder, said = mapped
-    assert "0 dropped" in said
-    assert "loop closures: 0" not in said
+def test_a_small_loop_is_closed_and_mapped_to_two_centimeters(mapped_folder):
+    """Two laps of 45 m: the mean error of relations to the next meters, and to where the robot was a lap before."""
+    folder, messages = mapped_folder
+    assert "0 dropped" in messages
+    assert "loop closures: 0" not in messages
     errors = evaluate_relations(read_tum(folder / "trajectory.tum"), true_relations(read_true_poses(open_log(LOG))))
     assert errors.overall.missed == 0
     assert errors.over_60_s.count > 30
@@ -41,15 +41,15 @@ def test_a_small_loop_is_closed_and_mapped_to_two_centimetres(mapped):
         assert score.rotation.mean < 0.2
 
 
-def test_its_bag_makes_the_same_map_as_far_as_quaternions_are_exact(mapped, tmp_path):
-    folder, _ = mapped
+def test_its_bag_makes_the_same_map_as_far_as_quaternions_are_exact(mapped_folder, tmp_path):
+    folder, _ = mapped_folder
     hmt_slam("simulate", "ring", "--seed", "2", "--set", "size=0.8", "--out", tmp_path / "bag")
     hmt_slam("map", tmp_path / "bag", "--out", tmp_path / "out")
     found, expected = (np.loadtxt(out / "trajectory.tum") for out in (tmp_path / "out", folder))
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
 
 
-def test_a_motion_model_that_is_told_the_truth_finds_nothing_wrong_with_the_odometry():
+def test_a_motion_model_that_has_the_true_parameters_finds_nothing_wrong_with_the_odometry():
     model, last, factors = MotionModel(MotionParameters()), None, []
     certain = 1e8 * np.eye(3)
     for record in open_log("sim:nested,seed=1", duration=600.0).records():

@@ -26,22 +26,22 @@ def test_the_same_place_is_near_and_on_the_same_side_of_the_wall():
 
 
 @pytest.fixture
-def seen():
+def share_views():
     laser = Laser(Settings(range=30.0))
     return lambda one, other: shared_view(wall_index(ROOMS), laser, np.array([one]), np.array([other]))[0, 0]
 
 
-def test_a_view_is_shared_with_itself_alone_in_full(seen):
-    assert seen([3.0, 3.0, 0.3], [3.0, 3.0, 0.3]) == pytest.approx(1.0)
-    assert 0.8 < seen([3.0, 3.0, 0.3], [2.8, 3.0, 0.3]) < 1.0
-    assert seen([3.0, 3.0, 0.3], [2.0, 2.0, 0.0]) == pytest.approx(seen([2.0, 2.0, 0.0], [3.0, 3.0, 0.3]))
+def test_a_view_is_shared_with_itself_alone_in_full(share_views):
+    assert share_views([3.0, 3.0, 0.3], [3.0, 3.0, 0.3]) == pytest.approx(1.0)
+    assert 0.8 < share_views([3.0, 3.0, 0.3], [2.8, 3.0, 0.3]) < 1.0
+    assert share_views([3.0, 3.0, 0.3], [2.0, 2.0, 0.0]) == pytest.approx(share_views([2.0, 2.0, 0.0], [3.0, 3.0, 0.3]))
 
 
-def test_who_looks_the_other_way_or_is_in_the_other_room_sees_other_walls(seen):
-    assert seen([3.0, 3.0, 0.5 * np.pi], [3.0, 3.0, -0.5 * np.pi]) < 0.02
-    assert seen([3.0, 1.0, np.pi], [9.0, 1.0, 0.0]) == 0.0
+def test_who_looks_the_other_way_or_is_in_the_other_room_sees_other_walls(share_views):
+    assert share_views([3.0, 3.0, 0.5 * np.pi], [3.0, 3.0, -0.5 * np.pi]) < 0.02
+    assert share_views([3.0, 1.0, np.pi], [9.0, 1.0, 0.0]) == 0.0
     # Through the door some of the far room is seen.
-    assert 0.0 < seen([3.0, 3.0, 0.0], [7.0, 3.0, 0.0]) < 0.6
+    assert 0.0 < share_views([3.0, 3.0, 0.0], [7.0, 3.0, 0.0]) < 0.6
 
 
 def test_where_nothing_is_seen_nothing_is_shared():

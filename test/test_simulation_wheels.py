@@ -71,7 +71,7 @@ def test_without_noise_odometry_is_the_truth():
     np.testing.assert_allclose(se2.between(scenario.poses[0], scenario.poses), scenario.odometry, atol=1e-9)
 
 
-def test_slips_come_as_often_and_are_as_large_as_asked_for():
+def test_slips_come_as_often_and_are_as_large_as_requested():
     distances = np.full(100_000, 0.1)
     errors = draw_slips(distances, 0.2, 2.0, np.random.default_rng(0))
     moving = np.any(errors != 0.0, axis=1)
@@ -83,10 +83,10 @@ def test_slips_come_as_often_and_are_as_large_as_asked_for():
     assert not draw_slips(distances, 0.2, 0.0, np.random.default_rng(0)).any()
 
 
-def test_a_log_with_slips_goes_astray_by_more_than_the_model_says():
+def test_a_log_with_slips_drifts_by_more_than_the_model_says():
     steady, slipping = (open_simulated(f"sim:ring,odometry=0,slips={n}").scenario for n in (0, 10))
     assert np.array_equal(steady.poses, slipping.poses)
-    astray = np.abs(se2.between(steady.odometry[-1], slipping.odometry[-1]))
-    assert astray.max() > 0.1
+    drift = np.abs(se2.between(steady.odometry[-1], slipping.odometry[-1]))
+    assert drift.max() > 0.1
     assert slipping.slips.any()
     assert not steady.slips.any()

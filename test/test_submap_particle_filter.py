@@ -21,12 +21,12 @@ COVARIANCE = np.diag([0.02, 0.02, 0.01]) ** 2
 INERTIA = RelativeMotion(STEP, np.diag([0.03, 0.03, 0.04]) ** 2)
 
 
-def predicted(increment, covariance=COVARIANCE, inertia=INERTIA):
+def make_prediction(increment, covariance=COVARIANCE, inertia=INERTIA):
     odometry = RelativeMotion(np.asarray(increment), covariance)
     return Prediction(odometry, inertia, fused=odometry)
 
 
-def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60, hypothesis=0):
+def drive_filter(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60, hypothesis=0):
     """A filter after a drive on a circle, and the true pose."""
     area_filter = ParticleFilter(mapping, hypothesis, area=0)
     truth = np.zeros(3)
@@ -36,7 +36,7 @@ def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60, hypothesis=0):
         truth = se2.compose(truth, STEP)
         scan = scan_in(ROOM, truth, noise=0.01, seed=k)
         sighting = PreparedScan(mapping, scan)
-        area_filter.track(sighting, predicted(STEP + np.asarray(odometry_error)))
+        area_filter.track(sighting, make_prediction(STEP + np.asarray(odometry_error)))
         if k % 5 == 0:
             events += 1
             area_filter.update(sighting, events)
@@ -45,7 +45,7 @@ def driven(mapping, odometry_error=(0.0, 0.0, 0.0), steps=60, hypothesis=0):
 
 
 def test_the_robot_is_found_though_odometry_drifts():
-    area_filter, truth = driven(LocalMapping(Configuration()), odometry_error=(0.02, 0.01, 0.01))
+    area_filter, truth = drive_filter(LocalMapping(Configuration()), odometry_error=(0.02, 0.01, 0.01))
     dead_reckoned = 59 * np.array([0.02, 0.01, 0.01])
     error = se2.between(truth, area_filter.pose)
     assert np.hypot(*error[:2]) < 0.05 < 0.1 * np.hypot(*dead_reckoned[:2])
@@ -53,9 +53,9 @@ def test_the_robot_is_found_though_odometry_drifts():
 
 
 def test_one_seed_gives_one_result_bit_for_bit_and_another_seed_another():
-    first, _ = driven(LocalMapping(Configuration(seed=1)))
-    again, _ = driven(LocalMapping(Configuration(seed=1)))
-    other, _ = driven(LocalMapping(Configuration(seed=2)))
+    first, _ = drive_filter(LocalMapping(Configuration(seed=1)))
+    again, _ = drive_filter(LocalMapping(Configuration(seed=1)))
+    other, _ = drive_filter(LocalMapping(Configuration(seed=2)))
     np.testing.assert_array_equal(first.poses, again.poses)
     np.testing.assert_array_equal(first.log_weights, again.log_weights)
     assert (first.poses != other.poses).any()
@@ -63,11 +63,11 @@ def test_one_seed_gives_one_result_bit_for_bit_and_another_seed_another():
 
 def test_a_branch_goes_its_own_way():
     mapping = LocalMapping(Configuration())
-    parent, _ = driven(mapping, steps=20)
+    parent, _ = drive_filter(mapping, steps=20)
     child = parent.branch(1)
     before = parent.poses.copy(), parent.keyframe_poses.copy()
     scan = scan_in(ROOM, (1.0, 0.5, 0.3))
-    child.track(PreparedScan(mapping, scan), predicted(STEP))
+    child.track(PreparedScan(mapping, scan), make_prediction(STEP))
     child.update(PreparedScan(mapping, scan), 99)
     child.add_keyframe(99, scan)
     np.testing.assert_array_equal(parent.poses, before[0])
@@ -80,7 +80,7 @@ def test_a_branch_goes_its_own_way():
 
 def test_resampling_keeps_the_leader_and_drops_what_has_no_weight():
     mapping = LocalMapping(Configuration())
-    area_filter, _ = driven(mapping, steps=8)
+    area_filter, _ = drive_filter(mapping, steps=8)
     count = len(area_filter.poses)
     area_filter.log_weights = np.full(count, -50.0)
     area_filter.log_weights[count - 1] = 0.0
@@ -96,21 +96,21 @@ def test_resampling_keeps_the_leader_and_drops_what_has_no_weight():
 
 
 def test_the_leader_stays_until_another_is_clearly_more_likely():
-    area_filter, _ = driven(LocalMapping(with_changes(Configuration(), {"filter.ess_fraction": 0.0})), steps=8)
+    area_filter, _ = drive_filter(LocalMapping(with_changes(Configuration(), {"filter.ess_fraction": 0.0})), steps=8)
     leader, count = area_filter.leader, len(area_filter.poses)
     other = (leader + 1) % count
     for advantage, leads in ((0.0, leader), (2.9, leader), (3.1, other)):
         area_filter.log_weights = np.full(count, -5.0)
         area_filter.log_weights[leader], area_filter.log_weights[other] = -advantage, 0.0
         # A scan without returns makes none likelier.
-        area_filter.track(PreparedScan(area_filter.mapping, blank_scan()), predicted(STEP))
+        area_filter.track(PreparedScan(area_filter.mapping, blank_scan()), make_prediction(STEP))
         area_filter.update(PreparedScan(area_filter.mapping, blank_scan()), 50)
         np.testing.assert_array_equal(area_filter.pose, area_filter.poses[area_filter.leader])
         assert area_filter.leader == leads
 
 
 def test_a_leader_that_is_less_likely_though_not_clearly_is_kept_by_resampling():
-    area_filter, _ = driven(LocalMapping(Configuration()), steps=8)
+    area_filter, _ = drive_filter(LocalMapping(Configuration()), steps=8)
     count = len(area_filter.poses)
     leader, heaviest = area_filter.leader, (area_filter.leader + 1) % count
     area_filter.log_weights = np.full(count, -50.0)
@@ -124,8 +124,8 @@ def test_a_leader_that_is_less_likely_though_not_clearly_is_kept_by_resampling()
     assert shares == [1, count - 1]
 
 
-def test_a_particle_that_is_clearly_more_likely_takes_the_lead_and_it_is_told():
-    area_filter, _ = driven(LocalMapping(Configuration()), steps=8)
+def test_a_particle_that_is_clearly_more_likely_takes_the_lead_and_it_is_reported():
+    area_filter, _ = drive_filter(LocalMapping(Configuration()), steps=8)
     count = len(area_filter.poses)
     heaviest = (area_filter.leader + 1) % count
     area_filter.log_weights = np.full(count, -50.0)
@@ -136,13 +136,13 @@ def test_a_particle_that_is_clearly_more_likely_takes_the_lead_and_it_is_told():
 
 
 def test_the_motion_of_a_step_is_that_of_one_particle_also_where_the_lead_changes():
-    area_filter, _ = driven(LocalMapping(Configuration()), steps=8)
+    area_filter, _ = drive_filter(LocalMapping(Configuration()), steps=8)
     area_filter.update(PreparedScan(area_filter.mapping, blank_scan()), 49)
     other = (area_filter.leader + 1) % len(area_filter.poses)
     area_filter.poses[other] = area_filter._last_poses[other] = area_filter._predicted_poses[other] = (1.0, 2.0, 0.5)
     area_filter.log_weights = np.full(len(area_filter.poses), -10.0)
     area_filter.log_weights[other] = 0.0
-    area_filter.track(PreparedScan(area_filter.mapping, blank_scan()), predicted(STEP))
+    area_filter.track(PreparedScan(area_filter.mapping, blank_scan()), make_prediction(STEP))
     step = area_filter.update(PreparedScan(area_filter.mapping, blank_scan()), 50)
     assert step.keyframes_moved
     np.testing.assert_allclose(step.increment, STEP, atol=1e-9)
@@ -151,7 +151,7 @@ def test_the_motion_of_a_step_is_that_of_one_particle_also_where_the_lead_change
 def test_effective_samples_equal_the_particles_where_all_weigh_the_same():
     mapping = LocalMapping(Configuration())
     area_filter = ParticleFilter(mapping, 0, 0)
-    area_filter.track(PreparedScan(area_filter.mapping, blank_scan()), predicted(STEP))
+    area_filter.track(PreparedScan(area_filter.mapping, blank_scan()), make_prediction(STEP))
     step = area_filter.update(PreparedScan(area_filter.mapping, blank_scan()), 1)
     assert step.effective_samples == pytest.approx(len(area_filter.poses))
 
@@ -161,7 +161,7 @@ def test_without_returns_the_particles_spread_as_odometry_says():
     configuration = replace(configuration, filter=replace(configuration.filter, particles=400))
     area_filter = ParticleFilter(LocalMapping(configuration), 0, 0)
     blank = PreparedScan(area_filter.mapping, blank_scan())
-    area_filter.track(blank, predicted([1.0, 0.0, 0.0], np.diag([0.2, 0.1, 0.05]) ** 2))
+    area_filter.track(blank, make_prediction([1.0, 0.0, 0.0], np.diag([0.2, 0.1, 0.05]) ** 2))
     area_filter.update(blank, 1)
     spread = area_filter.poses[1:].std(axis=0)
     np.testing.assert_allclose(spread, [0.2, 0.1, 0.05], rtol=0.1)
@@ -169,9 +169,9 @@ def test_without_returns_the_particles_spread_as_odometry_says():
 
 def test_a_lost_robot_is_found_by_the_search():
     mapping = LocalMapping(Configuration())
-    area_filter, truth = driven(mapping, steps=30)
+    area_filter, truth = drive_filter(mapping, steps=30)
     scan = scan_in(ROOM, se2.compose(truth, (0.3, 0.2, np.radians(12))))
-    area_filter.track(PreparedScan(mapping, scan), predicted(np.zeros(3), np.diag([0.1, 0.1, 0.1]) ** 2))
+    area_filter.track(PreparedScan(mapping, scan), make_prediction(np.zeros(3), np.diag([0.1, 0.1, 0.1]) ** 2))
     error = se2.between(se2.compose(truth, (0.3, 0.2, np.radians(12))), area_filter.pose)
     assert np.hypot(*error[:2]) < 0.05
     assert abs(error[2]) < np.radians(1.0)
@@ -179,7 +179,7 @@ def test_a_lost_robot_is_found_by_the_search():
 
 def test_a_change_of_area_moves_frame_and_map_together():
     mapping = LocalMapping(Configuration())
-    area_filter, truth = driven(mapping, steps=30)
+    area_filter, truth = drive_filter(mapping, steps=30)
     new_T_old = np.array([3.0, -1.0, 0.8])
     poses = [np.zeros(3)]
     for _ in range(3):
@@ -187,7 +187,7 @@ def test_a_change_of_area_moves_frame_and_map_together():
     content = [PlacedKeyframe(k, 7, scan_in(ROOM, pose), se2.compose(new_T_old, pose)) for k, pose in enumerate(poses)]
     area_filter.change_area(7, new_T_old, content)
     truth = se2.compose(truth, STEP)
-    area_filter.track(PreparedScan(mapping, scan_in(ROOM, truth)), predicted(STEP))
+    area_filter.track(PreparedScan(mapping, scan_in(ROOM, truth)), make_prediction(STEP))
     error = se2.between(se2.compose(new_T_old, truth), area_filter.pose)
     assert np.hypot(*error[:2]) < 0.03
     assert area_filter.area == 7
@@ -205,8 +205,8 @@ def test_beams_beyond_the_range_tell_free_space_up_to_it():
     assert len(points) + len(free) == 181
 
 
-def test_when_keyframes_move_the_map_is_built_anew_and_the_robot_stays_where_it_is_from_its_anchor():
-    area_filter, _ = driven(LocalMapping(Configuration()), steps=30)
+def test_when_keyframes_move_the_map_is_rebuilt_and_the_robot_stays_where_it_is_from_its_anchor():
+    area_filter, _ = drive_filter(LocalMapping(Configuration()), steps=30)
     scans = {0: scan_in(ROOM, np.zeros(3))}
     truth = np.zeros(3)
     for k in range(1, 30):

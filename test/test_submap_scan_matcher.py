@@ -23,7 +23,7 @@ def mapping():
     return LocalMapping(Configuration())
 
 
-def mapped(mapping, walls, poses, beams=361):
+def map_walls(mapping, walls, poses, beams=361):
     """A filter at the origin whose map holds the walls, as seen all round from some poses."""
     area_filter = ParticleFilter(mapping, 0, 0)
     for k, pose in enumerate(poses):
@@ -34,14 +34,14 @@ def mapped(mapping, walls, poses, beams=361):
     return area_filter
 
 
-def predicted(odometry, inertia=STILL):
+def make_prediction(odometry, inertia=STILL):
     """A prediction where odometry is as good as its model."""
     return Prediction(odometry, inertia, fused=inertia if odometry is None else odometry)
 
 
 def track(area_filter, walls, truth, odometry, inertia=STILL):
     sighting = PreparedScan(area_filter.mapping, scan_in(walls, truth, noise=0.01))
-    return area_filter.track(sighting, predicted(odometry, inertia))
+    return area_filter.track(sighting, make_prediction(odometry, inertia))
 
 
 def error_of(pose, truth):
@@ -50,8 +50,8 @@ def error_of(pose, truth):
 
 
 @pytest.mark.parametrize("slip", [-35.0, -10.0, 10.0, 35.0])
-def test_a_heading_slip_is_found_and_told(mapping, slip):
-    area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
+def test_a_heading_slip_is_found_and_reported(mapping, slip):
+    area_filter = map_walls(mapping, ROOM, [(0, 0, 0)])
     truth = np.array([0.3, 0.1, 0.2])
     slipped = se2.compose(truth, (0.0, 0.0, np.radians(slip)))
     tracked = track(area_filter, ROOM, truth, RelativeMotion(slipped, SURE))
@@ -61,8 +61,8 @@ def test_a_heading_slip_is_found_and_told(mapping, slip):
     assert tracked.contradicts_odometry
 
 
-def test_odometry_that_the_scan_confirms_is_not_doubted(mapping):
-    area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
+def test_odometry_that_the_scan_confirms_is_not_rejected(mapping):
+    area_filter = map_walls(mapping, ROOM, [(0, 0, 0)])
     truth = np.array([0.3, 0.1, 0.2])
     tracked = track(area_filter, ROOM, truth, RelativeMotion(truth + np.array([0.02, -0.02, 0.01]), SURE))
     assert not tracked.contradicts_odometry
@@ -70,7 +70,7 @@ def test_odometry_that_the_scan_confirms_is_not_doubted(mapping):
 
 
 def test_after_a_slip_the_particles_spread_in_heading_alone(mapping):
-    area_filter = mapped(mapping, CORRIDOR, [(x, 0, 0) for x in range(-6, 7)])
+    area_filter = map_walls(mapping, CORRIDOR, [(x, 0, 0) for x in range(-6, 7)])
     truth = np.array([0.3, 0.0, 0.0])
     track(area_filter, CORRIDOR, truth, RelativeMotion(np.array([0.3, 0.0, np.radians(30.0)]), SURE))
     spread = np.sqrt(np.diag(area_filter._motion_since_update.covariance))
@@ -80,24 +80,24 @@ def test_after_a_slip_the_particles_spread_in_heading_alone(mapping):
 
 
 def test_in_a_corridor_that_looks_the_same_all_along_odometry_tells_how_far(mapping):
-    area_filter = mapped(mapping, CORRIDOR, [(x, 0, 0) for x in range(-6, 7)])
+    area_filter = map_walls(mapping, CORRIDOR, [(x, 0, 0) for x in range(-6, 7)])
     for k in range(1, 11):
         truth = np.array([0.3 * k, 0.0, 0.0])
         # The velocity has it that the robot stands; and people hide a third of the walls.
         scan = scan_in(CORRIDOR, truth, noise=0.01, seed=k)
         scan.ranges[60:120] = 0.9
         sighting = PreparedScan(mapping, scan)
-        tracked = area_filter.track(sighting, predicted(RelativeMotion(np.array([0.3, 0.0, 0.0]), SURE)))
+        tracked = area_filter.track(sighting, make_prediction(RelativeMotion(np.array([0.3, 0.0, 0.0]), SURE)))
         assert not tracked.contradicts_odometry
     assert area_filter.pose[0] == pytest.approx(3.0, abs=0.1)
 
 
 def test_a_scan_that_shows_nothing_of_the_map_is_placed_by_odometry(mapping):
-    area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
+    area_filter = map_walls(mapping, ROOM, [(0, 0, 0)])
     elsewhere = box(-1.0, -0.6, 14.0, 0.9)
     area_filter.poses[:] = area_filter._predicted_poses[:] = (40.0, 0.0, 0.0)
     sighting = PreparedScan(mapping, scan_in(elsewhere, np.zeros(3)))
-    tracked = area_filter.track(sighting, predicted(RelativeMotion(np.array([0.3, 0.0, 0.1]), SURE)))
+    tracked = area_filter.track(sighting, make_prediction(RelativeMotion(np.array([0.3, 0.0, 0.1]), SURE)))
     np.testing.assert_allclose(area_filter.pose, [40.3, 0.0, 0.1], atol=1e-6)
     np.testing.assert_allclose(tracked.information, 0.0, atol=1e-9)
     assert not tracked.contradicts_odometry
@@ -107,7 +107,7 @@ def test_a_scan_that_shows_nothing_of_the_map_is_placed_by_odometry(mapping):
 
 
 def test_without_odometry_the_scan_is_searched_for_around_what_the_velocity_predicts(mapping):
-    area_filter = mapped(mapping, ROOM, [(0, 0, 0), (1, 1, 2)])
+    area_filter = map_walls(mapping, ROOM, [(0, 0, 0), (1, 1, 2)])
     truth = np.array([0.8, 0.6, np.radians(40.0)])
     tracked = track(area_filter, ROOM, truth, None)
     distance, angle = error_of(area_filter.pose, truth)
@@ -118,7 +118,9 @@ def test_without_odometry_the_scan_is_searched_for_around_what_the_velocity_pred
 
 def test_a_certain_prediction_stands_where_there_is_nothing_to_match(mapping):
     area_filter = ParticleFilter(mapping, 0, 0)
-    area_filter.track(PreparedScan(mapping, blank_scan()), predicted(RelativeMotion(np.array([0.1, 0.0, 0.0]), SURE)))
+    area_filter.track(
+        PreparedScan(mapping, blank_scan()), make_prediction(RelativeMotion(np.array([0.1, 0.0, 0.0]), SURE))
+    )
     np.testing.assert_allclose(area_filter.pose, [0.1, 0.0, 0.0], atol=1e-12)
 
 
@@ -140,7 +142,7 @@ def with_niches(seed=0, length=60.0):
 @pytest.mark.parametrize("ahead", [0.35, 0.6])
 def test_along_a_corridor_the_best_of_many_fits_is_taken(mapping, seed, ahead):
     walls = with_niches(seed)
-    area_filter = mapped(mapping, walls, [(x, 0, 0) for x in np.arange(-6.0, 0.1, 0.5)])
+    area_filter = map_walls(mapping, walls, [(x, 0, 0) for x in np.arange(-6.0, 0.1, 0.5)])
     truth = np.array([ahead, 0.05, 0.02])
     track(area_filter, walls, truth, None, RelativeMotion(np.zeros(3), np.diag([0.3, 0.05, 0.05]) ** 2))
     distance, angle = error_of(area_filter.pose, truth)
@@ -148,8 +150,8 @@ def test_along_a_corridor_the_best_of_many_fits_is_taken(mapping, seed, ahead):
     assert angle < 1.0
 
 
-def test_what_the_scans_leave_open_is_carried_on_until_the_next_keyframe(mapping):
-    area_filter = mapped(mapping, CORRIDOR, [(x, 0, 0) for x in range(-6, 7)])
+def test_what_the_scans_leave_open_is_extrapolated_until_the_next_keyframe(mapping):
+    area_filter = map_walls(mapping, CORRIDOR, [(x, 0, 0) for x in range(-6, 7)])
     along = []
     for k in range(1, 9):
         truth = np.array([0.1 * k, 0.0, 0.0])
@@ -166,10 +168,10 @@ def test_what_the_scans_leave_open_is_carried_on_until_the_next_keyframe(mapping
 
 @pytest.mark.parametrize("beams", [81, 91, 101])
 def test_a_turn_that_odometry_missed_in_a_pause_is_found_by_a_scan_that_fits_there_and_not_here(mapping, beams):
-    area_filter = mapped(mapping, ROOM, [(0, 0, 0)])
+    area_filter = map_walls(mapping, ROOM, [(0, 0, 0)])
     truth = np.array([0.0, -0.45, -1.4])
     sighting = PreparedScan(mapping, scan_in(ROOM, truth, beams=beams, noise=0.01))
-    prediction = predicted(
+    prediction = make_prediction(
         RelativeMotion(np.array([0.0, 0.0, -0.4]), SURE), RelativeMotion(np.array([0.0, -0.2, -1.6]), 16.0 * VAGUE)
     )
     tracked = area_filter.track(sighting, prediction)

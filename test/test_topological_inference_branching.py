@@ -45,7 +45,7 @@ def rooms_apart(rooms, offsets, sigma, configuration=None, last=PATH):
 
 
 def known_through_another(hybrid_map):
-    """Let area 0 be known only by way of area 1, where it is a neighbour of the robot's area 2."""
+    """Let area 0 be known only by way of area 1, where it is a neighbor of the robot's area 2."""
     arc_1_0 = hybrid_map.arc(2, 1).inverse().compose(hybrid_map.arc(2, 0))
     del hybrid_map.changed_arcs[0, 2]
     hybrid_map.set_arc(1, 0, arc_1_0, closure=False)
@@ -59,7 +59,7 @@ def weights_by_area(branches):
     return {area: weight / total for area, weight in weights.items()}
 
 
-def test_one_of_two_rooms_that_look_alike_to_the_prior_is_recognised():
+def test_one_of_two_rooms_that_look_alike_to_the_prior_is_recognized():
     parent, branching, newest = rooms_apart((OTHER, ROOM, ROOM), ((0.6, 0.4), (-0.5, 0.3)), 1.0)
     weights = weights_by_area(branching.cut(parent, newest[1:]))
     assert weights[1] > 0.9
@@ -86,7 +86,7 @@ def test_an_area_beyond_the_gate_is_no_candidate():
     assert branches.children[0].log_weight == 0.0
 
 
-def test_a_recognised_area_is_entered_at_the_pose_of_the_match():
+def test_a_recognized_area_is_entered_at_the_pose_of_the_match():
     parent, branching, newest = rooms_apart((ROOM, ROOM), ((0.6, -0.4),), 1.0)
     child = max(branching.cut(parent, newest[1:]).children, key=lambda child: child.log_weight)
     assert child.area == 0
@@ -101,7 +101,7 @@ def test_a_recognised_area_is_entered_at_the_pose_of_the_match():
     assert np.sqrt(arc.pose.covariance[0, 0]) < 0.2
 
 
-def test_the_robot_is_told_to_be_as_uncertain_in_the_area_as_its_newest_keyframe():
+def test_the_robot_is_made_as_uncertain_in_the_area_as_its_newest_keyframe():
     parent, branching, newest = rooms_apart((ROOM, ROOM), ((0.4, 0.3),), 0.7)
     grown = {k: (1.0 + k - newest[0]) * np.diag([1e-3, 2e-3, 1e-4]) for k in newest}
     parent = replace(parent, state=replace(parent.state, covariances=grown))
@@ -109,10 +109,10 @@ def test_the_robot_is_told_to_be_as_uncertain_in_the_area_as_its_newest_keyframe
     children = branching.cut(parent, newest[1:]).children
     assert {child.area for child in children} == {0, 2}
     for child in children:
-        carried = child.frame_change.compose(exact)
-        np.testing.assert_allclose(carried.covariance, child.state.covariances[newest[-1]], atol=1e-12)
+        kidnapped = child.frame_change.compose(exact)
+        np.testing.assert_allclose(kidnapped.covariance, child.state.covariances[newest[-1]], atol=1e-12)
         (moved,) = [r.pose for r in child.moved_keyframes if r.keyframe == newest[-1]]
-        np.testing.assert_allclose(carried.mean, moved, atol=1e-9)
+        np.testing.assert_allclose(kidnapped.mean, moved, atol=1e-9)
 
 
 def test_candidates_beyond_the_number_that_is_examined_keep_their_prior_mass():
@@ -154,14 +154,14 @@ def approaching(xs):
     return parent, branching, newest
 
 
-def test_keyframes_that_see_an_area_but_are_not_in_its_place_yet_are_asked_again():
+def test_keyframes_that_see_an_area_but_are_not_in_its_place_yet_are_examined_again():
     parent, branching, newest = approaching((8.7, 8.2, 7.7, 7.2, 6.7, 6.2))
     branches = branching.cut(parent, newest)
     assert [child.area for child in branches.children] == [parent.area + 1]
     assert 0 not in branches.children[0].state.matched_keyframes
 
 
-def test_whether_the_robot_is_in_known_ground_now_is_asked_of_the_newest_keyframes():
+def test_whether_the_robot_is_in_known_ground_now_is_examined_with_the_newest_keyframes():
     parent, branching, _ = approaching((6.2, 5.6, 5.0, 4.4, 3.8, 3.2))
     parent = replace(parent, state=replace(parent.state, unmatched_keyframes=(), pending_candidates=(0,)))
     stay, joined = branching.recheck(parent, (0,)).children

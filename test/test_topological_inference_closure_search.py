@@ -47,14 +47,14 @@ def test_their_maps_are_made_ahead_one_at_a_time(lattice, monkeypatch):
         """How many maps a comparison needs after some looks ahead from one before it, and what it finds."""
         search = ClosureSearch(Configuration(), LatticeScans())
         excluded = {HERE}
-        asked = query(lattice)
-        search.compare(lattice, HERE, asked, dict.fromkeys(range(400), asked.poses), excluded, 8)
+        requested = query(lattice)
+        search.compare(lattice, HERE, requested, dict.fromkeys(range(400), requested.poses), excluded, 8)
         for _ in range(looks):
             before = len(built)
             search.look_ahead(lattice)
             assert len(built) - before <= 1
         before = len(built)
-        found = search.compare(lattice, HERE, asked, {}, excluded, 8)
+        found = search.compare(lattice, HERE, requested, {}, excluded, 8)
         return len(built) - before, [fit.log_weight for fit in found.fits]
 
     without, plain = maps_of(0)

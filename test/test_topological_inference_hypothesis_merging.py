@@ -1,4 +1,4 @@
-"""Hypotheses that say the same are told from those that do not."""
+"""Hypotheses that are equivalent are distinguished from others."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def chain(covariance=SHARP):
     return hybrid_map
 
 
-def entered(area, pose, covariance=SHARP):
+def enter_known_area(area, pose, covariance=SHARP):
     """From area 3 the robot came into a known one, where it is at ``area_T_base``."""
     hybrid_map = chain(VAGUE)
     hybrid_map.set_arc(3, area, PoseGaussian(area * STEP - np.array([5.0, 0.0, 0.0]), covariance), closure=True)
@@ -36,13 +36,13 @@ def in_next_area(pose):
     return se2.between(STEP, pose)
 
 
-def with_sharp_arc(claim):
-    claim.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
-    return claim
+def with_sharp_arc(placement):
+    placement.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
+    return placement
 
 
-def test_the_same_place_entered_by_one_area_or_by_the_next_is_one_claim():
-    one, other = with_sharp_arc(entered(0, POSE)), with_sharp_arc(entered(1, in_next_area(POSE)))
+def test_the_same_place_entered_by_one_area_or_by_the_next_is_one_placement():
+    one, other = with_sharp_arc(enter_known_area(0, POSE)), with_sharp_arc(enter_known_area(1, in_next_area(POSE)))
     assert one.is_equivalent(other)
     assert other.is_equivalent(one)
 
@@ -50,46 +50,46 @@ def test_the_same_place_entered_by_one_area_or_by_the_next_is_one_claim():
 @pytest.mark.parametrize(
     ("offset", "same"), [([0.3, 0.2, 0.05], True), ([0.7, 0.0, 0.0], False), ([0.0, 0.0, 0.2], False)]
 )
-def test_modes_that_part_by_less_than_is_mended_are_one_claim(offset, same):
-    assert entered(0, POSE).is_equivalent(entered(0, se2.compose(POSE, np.array(offset)))) == same
+def test_modes_that_part_by_less_than_is_mended_are_one_placement(offset, same):
+    assert enter_known_area(0, POSE).is_equivalent(enter_known_area(0, se2.compose(POSE, np.array(offset)))) == same
 
 
-def test_known_ground_is_a_claim_of_its_own():
+def test_known_ground_is_a_placement_of_its_own():
     tracked = LocalizedHypothesis(chain(), 0, POSE, {0})
-    recognised = entered(0, POSE)
+    recognised = enter_known_area(0, POSE)
     assert not tracked.is_equivalent(recognised)
     assert not recognised.is_equivalent(tracked)
 
 
-def with_another_loop(claim, covariance=SHARP):
-    """The same, and the robot's area is said to lie beside area 2 as well."""
-    claim.hybrid_map.set_arc(claim.area, 2, PoseGaussian(2.0 * STEP, covariance), closure=True)
-    return claim
+def with_another_loop(placement, covariance=SHARP):
+    """The same, and the robot's area is placed beside area 2 as well."""
+    placement.hybrid_map.set_arc(placement.area, 2, PoseGaussian(2.0 * STEP, covariance), closure=True)
+    return placement
 
 
 @pytest.mark.parametrize("covariance", [SHARP, 100.0 * SHARP])
-def test_a_further_loop_is_a_claim_of_its_own(covariance):
-    open_still, closed = entered(0, POSE), with_another_loop(entered(0, POSE), covariance)
+def test_a_further_loop_is_a_placement_of_its_own(covariance):
+    open_still, closed = enter_known_area(0, POSE), with_another_loop(enter_known_area(0, POSE), covariance)
     assert not open_still.is_equivalent(closed)
     assert not closed.is_equivalent(open_still)
 
 
-def test_a_loop_that_one_hypothesis_closes_by_two_arcs_and_one_by_the_second_is_one_claim():
-    direct, around = entered(0, POSE), with_another_loop(entered(0, POSE))
-    for claim in (direct, around):
-        claim.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
-        claim.hybrid_map.set_arc(1, 2, PoseGaussian(STEP, SHARP), closure=False)
+def test_a_loop_that_one_hypothesis_closes_by_two_arcs_and_one_by_the_second_is_one_placement():
+    direct, around = enter_known_area(0, POSE), with_another_loop(enter_known_area(0, POSE))
+    for placement in (direct, around):
+        placement.hybrid_map.set_arc(0, 1, PoseGaussian(STEP, SHARP), closure=False)
+        placement.hybrid_map.set_arc(1, 2, PoseGaussian(STEP, SHARP), closure=False)
     assert direct.is_equivalent(around)
     assert around.is_equivalent(direct)
 
 
-def test_what_a_hypothesis_is_uncertain_of_it_does_not_claim():
-    assert not entered(0, POSE).is_equivalent(entered(1, in_next_area(POSE)))
+def test_what_a_hypothesis_is_uncertain_of_it_does_not_place():
+    assert not enter_known_area(0, POSE).is_equivalent(enter_known_area(1, in_next_area(POSE)))
 
 
-def test_the_heaviest_stands_for_all_that_say_the_same():
-    claims = [entered(0, POSE), entered(1, POSE), entered(0, POSE + 0.01)]
+def test_the_heaviest_represents_all_equivalent_ones():
+    placements = [enter_known_area(0, POSE), enter_known_area(1, POSE), enter_known_area(0, POSE + 0.01)]
     weights = np.log([0.2, 0.3, 0.5])
-    found = merge_equivalent(claims, weights)
+    found = merge_equivalent(placements, weights)
     assert list(found) == [2, 1]
     np.testing.assert_allclose(np.exp(list(found.values())), [0.7, 0.3])

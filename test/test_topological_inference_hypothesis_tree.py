@@ -1,4 +1,4 @@
-"""Weights of the leaves and what is remembered of them."""
+"""Weights of the hypotheses and what is remembered of them."""
 
 import math
 from dataclasses import replace
@@ -18,14 +18,14 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import (
 )
 
 
-def settled(weights, skipped=0.0, unexamined=0.0, most=16, least=1e-6):
+def weigh(weights, skipped=0.0, unexamined=0.0, most=16, least=1e-6):
     with np.errstate(divide="ignore"):
         logs, log_skipped = np.log(np.array(weights)), float(np.log(skipped))
     return normalize_and_reduce(logs, log_skipped, unexamined, most, least, random_stream(0, Purpose.HYPOTHESES, 0))
 
 
-def test_weights_are_normalised():
-    assert settled([2.0, 6.0]).probabilities.tolist() == pytest.approx([0.25, 0.75])
+def test_weights_are_normalized():
+    assert weigh([2.0, 6.0]).probabilities.tolist() == pytest.approx([0.25, 0.75])
 
 
 def test_hopelessly_small_weights_do_not_underflow():
@@ -36,29 +36,29 @@ def test_hopelessly_small_weights_do_not_underflow():
 
 
 def test_what_was_skipped_keeps_its_mass():
-    found = settled([3.0, 6.0], skipped=1.0)
+    found = weigh([3.0, 6.0], skipped=1.0)
     assert found.unexamined == pytest.approx(0.1)
     assert found.probabilities.sum() == pytest.approx(0.9)
 
 
 def test_what_was_not_examined_earlier_keeps_its_share():
-    found = settled([1.0, 1.0], unexamined=0.2)
+    found = weigh([1.0, 1.0], unexamined=0.2)
     assert found.probabilities.tolist() == pytest.approx([0.4, 0.4])
     assert found.unexamined == pytest.approx(0.2)
 
 
 def test_what_is_dropped_is_counted_as_unexamined():
-    found = settled([1.0, 1e-3], least=0.01)
+    found = weigh([1.0, 1e-3], least=0.01)
     assert found.indices.tolist() == [0]
     assert found.unexamined == pytest.approx(1e-3, rel=0.01)
 
 
 def test_the_best_is_never_dropped():
-    assert settled([1.0, 1.0, 1.0], least=0.5).indices.tolist() == [0, 1, 2]
+    assert weigh([1.0, 1.0, 1.0], least=0.5).indices.tolist() == [0, 1, 2]
 
 
 def test_the_reduction_keeps_the_total():
-    found = settled(np.linspace(0.5, 1.5, 40), most=5)
+    found = weigh(np.linspace(0.5, 1.5, 40), most=5)
     assert found.indices.size == 5
     assert found.probabilities.sum() == pytest.approx(1.0)
 

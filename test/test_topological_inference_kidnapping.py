@@ -33,17 +33,17 @@ NOWHERE = np.concatenate((box(-1.0, 1.0, 4.2, 6.5), box(2.6, 4.0, 3.6, 5.0)))
 HALL = np.concatenate((box(-3.0, 0.5, 9.0, 4.5), box(4.0, 3.0, 5.0, 4.0)))
 
 
-def asked(rooms, doubts, first=FAR, hall=2):
-    """What comes of doubts in the last room, {keyframe of it: nats}; arcs have the others far off but the first.
+def spawn_branches(rooms, inconsistencies, first=FAR, hall=2):
+    """The branches by inconsistencies in the last room, {keyframe of it: nats}; all arcs but the first lead far off.
 
-    The robot was carried there from a hall, in which it stored ``hall`` keyframes.
+    The robot was kidnapped there from a hall, in which it stored ``hall`` keyframes.
     """
     parent, branching, newest = rooms_apart(rooms, [first, *[FAR] * (len(rooms) - 2)], 0.1)
     for k, keyframe in enumerate(newest[:hall]):
         branching._replica.scans[keyframe] = scan_in(
             HALL, PATH[k], noise=0.01, seed=keyframe, field_of_view=2 * np.pi, beams=361
         )
-    notes = replace(parent.state, kidnapping_evidence={newest[n]: nats for n, nats in doubts.items()})
+    notes = replace(parent.state, kidnapping_evidence={newest[n]: nats for n, nats in inconsistencies.items()})
     return spawn_kidnapped_hypothesis(branching, replace(parent, state=notes))
 
 
@@ -53,7 +53,7 @@ def since(child):
 
 
 def test_the_keyframes_since_then_begin_an_area_of_which_nothing_tells_where_it_is():
-    stays, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}).children
+    stays, lost = spawn_branches((ROOM, OTHER, ROOM), {2: 8.0}).children
     assert (stays.area, stays.log_weight, stays.moved_keyframes) == (2, 0.0, ())
     assert lost.area == 3
     assert lost.state.localization.since == 14
@@ -69,7 +69,7 @@ def test_the_keyframes_since_then_begin_an_area_of_which_nothing_tells_where_it_
 
 
 def test_that_the_place_is_known_elsewhere_speaks_for_it_and_one_look_has_found_it():
-    _, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}).children
+    _, lost = spawn_branches((ROOM, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight > PRIOR + 8.0 + 1.0
     assert lost.state.localization.counted_evidence == pytest.approx(lost.log_weight - PRIOR - 8.0)
     assert lost.state.localization.candidate.area == 0
@@ -99,33 +99,33 @@ def test_where_nothing_is_stored_it_goes_over_into_the_area_where_it_was_recogni
     run.keyframe(poses[-1], cut=3)
     found = replace(run.tsbi.state.hypothesis_states[0], localization=Tracking(0))
     run.tsbi._state = replace(run.tsbi._state, hypothesis_states={0: found})
-    (leaf,) = run.keyframe(poses[-1], mapping=mapping).hypotheses
-    assert leaf.area == area
+    (hypothesis,) = run.keyframe(poses[-1], mapping=mapping).hypotheses
+    assert hypothesis.area == area
     assert run.tsbi.state.hypothesis_states[0].localization.relocalized_area is None
 
 
-def test_on_ground_that_nobody_knows_the_doubts_alone_speak_for_it():
-    _, lost = asked((OTHER, OTHER, ROOM), {2: 8.0}).children
+def test_on_ground_that_nobody_knows_the_inconsistencies_alone_speak_for_it():
+    _, lost = spawn_branches((OTHER, OTHER, ROOM), {2: 8.0}).children
     assert lost.log_weight == pytest.approx(PRIOR + 8.0 + math.log(KIDNAPPED_UNMAPPED_PRIOR), abs=0.5)
     assert lost.state.localization.candidate is None
 
 
 def test_that_the_place_is_known_where_the_robot_would_be_anyway_speaks_against_it():
-    _, lost = asked((ROOM, OTHER, ROOM), {2: 8.0}, HERE, hall=0).children
+    _, lost = spawn_branches((ROOM, OTHER, ROOM), {2: 8.0}, HERE, hall=0).children
     assert lost.log_weight < PRIOR + 8.0 - 2.0
 
 
 @pytest.mark.parametrize(
-    "doubts",
+    "inconsistencies",
     [{}, {2: 1.0}, {4: 12.0}],
     ids=["sure", "hardly doubtful", "just now, and two keyframes are too few"],
 )
-def test_a_robot_that_is_hardly_displaced_is_not_asked_about(doubts):
-    assert asked((ROOM, OTHER, ROOM), doubts) is None
+def test_a_robot_that_is_hardly_displaced_is_not_examined(inconsistencies):
+    assert spawn_branches((ROOM, OTHER, ROOM), inconsistencies) is None
 
 
 def test_an_area_is_not_left_without_keyframes():
-    _, lost = asked((ROOM, OTHER, ROOM), {0: 8.0}).children
+    _, lost = spawn_branches((ROOM, OTHER, ROOM), {0: 8.0}).children
     assert [r.keyframe for r in lost.moved_keyframes] == [13, 14, 15, 16, 17]
 
 
@@ -153,8 +153,8 @@ def test_where_nothing_is_stored_it_is_lost_if_it_is_rather_in_another_place(wor
     notes = parent.state
     for event, pose in enumerate(PATH[:4], start=12):
         scan = scan_in(world, pose, noise=0.01, seed=event, field_of_view=2 * np.pi, beams=361)
-        claimed = se2.between(PATH[0], pose) + np.array([off, 0.0, 0.0])
-        notes = notes.after_scan(event, 6.0, PoseInArea(1, event, claimed))
+        placed_with_error = se2.between(PATH[0], pose) + np.array([off, 0.0, 0.0])
+        notes = notes.after_scan(event, 6.0, PoseInArea(1, event, placed_with_error))
         branching.keep_scans(event, scan, notes.unstored_poses)
     child = decide_without_mapping(branching, replace(parent, state=notes), 15)
     assert since(child) == lost
@@ -200,9 +200,9 @@ def test_who_says_where_it_is_knows_better_than_where_it_would_be_if_it_had_not_
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
     alarm = FalseAlarm(PoseInArea(1, newest[0], np.zeros(3)), 0.4)
     notes = replace(parent.state, localization=Lost(newest[0], alarm))
-    told = InitialPose(0, PoseGaussian(se2.between(PATH[0], PATH[5]), np.diag([0.3, 0.3, 0.2]) ** 2))
+    reported = InitialPose(0, PoseGaussian(se2.between(PATH[0], PATH[5]), np.diag([0.3, 0.3, 0.2]) ** 2))
     pose = parent.hybrid_map.keyframes(2)[newest[-1]]
-    keyframe = Keyframe(newest[-1], branching._replica.scans[newest[-1]], 1.0, (), initial_pose=told, mapping=False)
+    keyframe = Keyframe(newest[-1], branching._replica.scans[newest[-1]], 1.0, (), initial_pose=reported, mapping=False)
     looked = relocalization.begin_relocalization(branching, replace(parent, state=notes), keyframe, pose)
     lost = [child.state.localization for child in looked.children if child.state.is_lost]
     assert [one.false_alarm for one in lost] == [None]
@@ -218,7 +218,7 @@ def test_a_robot_that_may_have_stayed_where_much_was_moved_is_nowhere_rather_tha
     assert known.with_false_alarm(np.array([True, False]), 0.5, 4).probabilities[0] > 0.8
 
 
-def test_scans_that_the_map_does_not_hold_are_remembered_as_long_as_they_are_doubtful():
+def test_scans_that_the_map_does_not_hold_are_remembered_as_long_as_they_are_uncertain():
     run, poses = Run(RING), ring_drive(8)
     for pose in poses[:6]:
         run.keyframe(pose)
@@ -251,7 +251,7 @@ def test_what_contradicts_at_every_keyframe_is_clutter():
     assert notes.kidnapping_test == (-math.inf, 0)
 
 
-def test_a_doubt_passes_with_scans_that_fit():
+def test_an_inconsistency_passes_with_scans_that_fit():
     notes = HypothesisState().after_scan(5, 4.0)
     for event in range(6, 9):
         notes = notes.after_scan(event, -0.3)
@@ -272,5 +272,5 @@ def test_what_a_displaced_robot_saw_is_not_forgotten_at_the_same_event():
         assert len(run.keyframe(pose).hypotheses) == 1
     run._answer = lambda sequence, _events: run.tsbi.handle(AreaEvents(sequence, (), (PrunedKeyframe(sequence, 0),)))
     (answer,) = run.keyframe(poses[14])
-    assert [leaf.lost for leaf in answer.hypotheses] == [False, True]
+    assert [hypothesis.lost for hypothesis in answer.hypotheses] == [False, True]
     assert not answer.pruned_keyframes

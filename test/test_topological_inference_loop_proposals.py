@@ -20,7 +20,7 @@ LAP, LAST = 96, 120  # keyframes
 
 
 class Told(LoopProposer):
-    """Proposes what it is told."""
+    """Proposes what the test sets."""
 
     def __init__(self, loop, configuration, views):
         super().__init__(configuration, views)
@@ -59,7 +59,7 @@ def twice_into_the_first_corridor(shift, proposing=GATED):
     return run, poses, [(a, b, arc) for a, b, arc in best.all_arcs() if arc.closure]
 
 
-def test_nobody_proposes_where_nobody_asks_for_it():
+def test_nobody_proposes_where_nobody_requests_it():
     assert Run(RING).tsbi._branching.landmarks is None
 
 

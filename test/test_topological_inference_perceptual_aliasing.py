@@ -17,7 +17,7 @@ ROOM = np.concatenate((box(-6.0, -3.0, 6.0, 4.0), box(1.0, 1.0, 2.5, 2.0), box(-
 
 
 def corridor(seed):
-    """A corridor of 40 m with a niche every few metres, each 0.2 m deep and 1 m wide, on both sides."""
+    """A corridor of 40 m with a niche every few meters, each 0.2 m deep and 1 m wide, on both sides."""
     walls = []
     for side in (-1.0, 1.0):
         at, steps = -20.0, np.random.default_rng([seed, int(side) + 1]).uniform(2.0, 5.0, 30)
@@ -29,29 +29,29 @@ def corridor(seed):
     return np.array(walls)
 
 
-def seen(walls, poses, seed):
+def make_grid(walls, poses, seed):
     scans = [scan_in(walls, pose, noise=0.01, seed=seed + k) for k, pose in enumerate(poses)]
     return build_area_grid(scans, se2.between(poses[0], poses), MODEL)
 
 
 def elsewhere(walls, seed):
-    return NegativeSample(seen(walls, PATH, seed), se2.between(PATH[0], PATH[len(PATH) // 2]))
+    return NegativeSample(make_grid(walls, PATH, seed), se2.between(PATH[0], PATH[len(PATH) // 2]))
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_corridor_fits_into_the_same_one_better_than_into_others_and_there_better_than_a_room(seed):
-    query, places = seen(corridor(seed), PATH[6:11], 50), [elsewhere(corridor(100 + seed), 200)]
+    query, places = make_grid(corridor(seed), PATH[6:11], 50), [elsewhere(corridor(100 + seed), 200)]
     (same,) = best_shares(query, [elsewhere(corridor(seed), 300)], SETTINGS)
     (other,) = best_shares(query, places, SETTINGS)
-    (room,) = best_shares(seen(ROOM, PATH[6:11], 50), places, SETTINGS)
+    (room,) = best_shares(make_grid(ROOM, PATH[6:11], 50), places, SETTINGS)
     assert same > 0.95
     assert room < 0.6 < other < same
 
 
 def test_both_ways_through_a_corridor_are_tried():
     there, back = corridor(1), drive((4.0, 0.0), (1.5, 0.0))
-    (forth,) = best_shares(seen(there, PATH[6:11], 50), [elsewhere(there, 200)], SETTINGS)
-    (turned,) = best_shares(seen(there, back, 50), [elsewhere(there, 200)], SETTINGS)
+    (forth,) = best_shares(make_grid(there, PATH[6:11], 50), [elsewhere(there, 200)], SETTINGS)
+    (turned,) = best_shares(make_grid(there, back, 50), [elsewhere(there, 200)], SETTINGS)
     assert min(forth, turned) > 0.7
 
 

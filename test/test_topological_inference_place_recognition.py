@@ -15,27 +15,27 @@ from hmt_slam_ros.topological_inference.place_recognition import (
 SMALL, LARGE = box(-1.0, -1.0, 1.0, 1.0), box(-8.0, -8.0, 8.0, 8.0)
 
 
-def seen(walls, x, y, heading, beams=720):
+def make_scan(walls, x, y, heading, beams=720):
     return scan_in(walls, np.array([x, y, heading]), beams=beams, field_of_view=2 * np.pi)
 
 
 def test_a_look_does_not_depend_on_heading_nor_on_the_number_of_beams():
-    one = describe_scan(seen(two_rooms(), 2.0, 2.0, 0.0))
+    one = describe_scan(make_scan(two_rooms(), 2.0, 2.0, 0.0))
     assert one.shape == (DESCRIPTOR_SIZE,)
-    np.testing.assert_allclose(describe_scan(seen(two_rooms(), 2.0, 2.0, 2.3)), one, atol=0.02)
-    np.testing.assert_allclose(describe_scan(seen(two_rooms(), 2.0, 2.0, 0.0, beams=181)), one, atol=0.05)
+    np.testing.assert_allclose(describe_scan(make_scan(two_rooms(), 2.0, 2.0, 2.3)), one, atol=0.02)
+    np.testing.assert_allclose(describe_scan(make_scan(two_rooms(), 2.0, 2.0, 0.0, beams=181)), one, atol=0.05)
 
 
 def test_a_scan_without_a_return_has_a_look():
     walls = box(-200.0, -200.0, 200.0, 200.0)
-    np.testing.assert_allclose(describe_scan(seen(walls, 0.0, 0.0, 0.0)), np.log(20.0))
+    np.testing.assert_allclose(describe_scan(make_scan(walls, 0.0, 0.0, 0.0)), np.log(20.0))
 
 
 @pytest.fixture
 def looks():
-    scans = {k: seen(SMALL, 0.1 * k, 0.0, 0.0) for k in range(3)}
-    scans |= {k: seen(LARGE, 0.1 * k, 0.0, 0.0) for k in range(3, 9)}
-    scans[9] = seen(SMALL, 0.25, 0.05, 2.0)
+    scans = {k: make_scan(SMALL, 0.1 * k, 0.0, 0.0) for k in range(3)}
+    scans |= {k: make_scan(LARGE, 0.1 * k, 0.0, 0.0) for k in range(3, 9)}
+    scans[9] = make_scan(SMALL, 0.25, 0.05, 2.0)
     return ScanDescriptors(scans)
 
 

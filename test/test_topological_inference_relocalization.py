@@ -1,12 +1,12 @@
-"""A robot that wakes up somewhere in a map, or is carried, maps around itself, until it is recognized where it is."""
+"""A robot that starts somewhere in a map, or is kidnapped, maps around itself, until it is recognized where it is."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from benchmark.awakening import FAR, awakened, mapped
-from benchmark.kidnapping import SOON, kidnapped
+from benchmark.awakening import FAR, map_log, try_start
+from benchmark.kidnapping import SOON, drive_kidnapped
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -27,7 +27,7 @@ OFF = np.array([5.0, 0.0, 0.0])
 
 @pytest.fixture(scope="module")
 def maps():
-    return mapped(WORLD, Configuration())
+    return map_log(WORLD, Configuration())
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +42,8 @@ def begin(office):
     return [scan for scan in office.scans if office.records[scan].measurement.stamp in known][60]
 
 
-def carried(office, records, scans):
-    """A run that woke up in a map and read so many scans."""
+def start_in_map(office, records, scans):
+    """A run that started in a map and read so many scans."""
     run = LockStepRun(Configuration(), state=office.state)
     run.lock_step.feed(PoseReset())
     for record in records:
@@ -54,16 +54,16 @@ def carried(office, records, scans):
     return run
 
 
-def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office, begin):
+def test_it_begins_a_new_area_to_which_an_arc_leads_that_has_no_information(office, begin):
     before = Replica.from_state(office.state.processes["tsbi"].replica)
-    run = carried(office, office.records[begin:], 10)
+    run = start_in_map(office, office.records[begin:], 10)
     replica = Replica.from_state(run.state.processes["tsbi"].replica)
-    (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
-    assert leaf.lost
-    assert leaf.area not in before.maps[before.best_hypothesis].area_ids()
-    hybrid_map = replica.maps[leaf.id]
-    (beside,) = hybrid_map.neighbors(leaf.area)
-    assert is_uninformative(hybrid_map.arc(beside, leaf.area))
+    (hypothesis,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
+    assert hypothesis.lost
+    assert hypothesis.area not in before.maps[before.best_hypothesis].area_ids()
+    hybrid_map = replica.maps[hypothesis.id]
+    (beside,) = hybrid_map.neighbors(hypothesis.area)
+    assert is_uninformative(hybrid_map.arc(beside, hypothesis.area))
     for area in before.maps[before.best_hypothesis].area_ids():
         assert hybrid_map.keyframes(area).keys() == before.maps[before.best_hypothesis].keyframes(area).keys()
 
@@ -71,7 +71,7 @@ def test_it_begins_a_new_area_to_which_an_arc_leads_that_tells_nothing(office, b
 @pytest.mark.parametrize(("kind", "share"), [("whole", 0.15), ("whole", 0.7), ("first half", 0.5)])
 def test_it_is_recognized_where_it_is(maps, kind, share):
     log = maps[kind]
-    found = awakened(log, log.starts[int(share * len(log.starts))])
+    found = try_start(log, log.starts[int(share * len(log.starts))])
     assert found.right
     assert not found.wrong
     assert found.found <= FAR
@@ -80,14 +80,14 @@ def test_it_is_recognized_where_it_is(maps, kind, share):
 @pytest.mark.parametrize("share", [0.3, 0.8])
 def test_without_landmarks_as_prior_it_is_recognized_too(maps, share):
     log = maps["first half"]
-    asked = replace(log, configuration=with_changes(Configuration(), {"places.prior": False}))
-    found = awakened(asked, log.starts[int(share * len(log.starts))])
+    requested = replace(log, configuration=with_changes(Configuration(), {"places.prior": False}))
+    found = try_start(requested, log.starts[int(share * len(log.starts))])
     assert found.right
     assert not found.wrong
     assert found.found <= FAR
 
 
-def test_in_the_map_of_the_first_half_it_wakes_up_in_the_second_near_keyframes_of_the_first(maps):
+def test_in_the_map_of_the_first_half_it_starts_in_the_second_near_keyframes_of_the_first(maps):
     log, whole = maps["first half"], maps["whole"]
     scans = Replica.from_state(log.state.processes["tsbi"].replica).scans.values()
     stamps = {log.records[scan].measurement.stamp: n for n, scan in enumerate(log.scans)}
@@ -101,8 +101,8 @@ def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, m
     """Every other look finds it 5 m off."""
     looks, found = [], ClosureSearch.localize_globally
 
-    def off_at_times(search, *asked):
-        looks.append(found(search, *asked))
+    def off_at_times(search, *requested):
+        looks.append(found(search, *requested))
         if len(looks) % 2:
             return looks[-1]
         moved = [
@@ -112,20 +112,20 @@ def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, m
         return looks[-1]._replace(candidates=tuple(moved))
 
     monkeypatch.setattr(ClosureSearch, "localize_globally", off_at_times)
-    run = carried(office, office.records[begin:], 150)
-    (leaf,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
+    run = start_in_map(office, office.records[begin:], 150)
+    (hypothesis,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
     assert sum(look.best is not None and look.best[1] > 0.9 for look in looks) >= 3
-    assert leaf.lost
+    assert hypothesis.lost
 
 
 @pytest.mark.parametrize("seed", [4, 5, 6, 7])
 def test_in_a_building_that_it_does_not_know_it_stays_lost(office, seed):
-    run = carried(office, open_log(f"sim:grid,seed={seed},size=0.7").records(), 150)
-    assert all(leaf.lost for leaf in run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses)
+    run = start_in_map(office, open_log(f"sim:grid,seed={seed},size=0.7").records(), 150)
+    assert all(hypothesis.lost for hypothesis in run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses)
 
 
-def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(office, begin):
-    """In the place of a keyframe; what is said is 0.4 m and 6 degrees off."""
+def test_a_robot_that_stands_still_is_localized_at_its_initial_pose(office, begin):
+    """In the place of a keyframe; the initial pose is 0.4 m and 6 degrees off."""
     replica = Replica.from_state(office.state.processes["tsbi"].replica)
     hybrid_map = replica.maps[replica.best_hypothesis]
     scan = office.records[begin].measurement
@@ -135,38 +135,38 @@ def test_a_robot_that_stands_still_is_recognized_where_somebody_says_that_it_is(
         for keyframe, pose in hybrid_map.keyframes(area).items()
         if replica.scans[keyframe].stamp == scan.stamp
     ]
-    said = PoseGaussian(se2.compose(at[1], np.array([0.3, -0.25, 0.1])), np.diag([0.5, 0.5, 0.26]) ** 2)
+    messages = PoseGaussian(se2.compose(at[1], np.array([0.3, -0.25, 0.1])), np.diag([0.5, 0.5, 0.26]) ** 2)
     run = LockStepRun(Configuration(), state=office.state)
-    run.lock_step.feed(PoseReset(InitialPose(at[0], said)))
+    run.lock_step.feed(PoseReset(InitialPose(at[0], messages)))
     for k in range(3):
         stamp = scan.stamp + k * 200_000_000
         run.lock_step.feed(Odometry(stamp, np.zeros(3)))
         run.lock_step.feed(replace(scan, stamp=stamp))
     run.lock_step.feed(Odometry(stamp + 200_000_000, np.zeros(3)))
-    leaves = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
-    assert sum(leaf.probability for leaf in leaves if not leaf.lost) > 0.9
+    hypotheses = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
+    assert sum(hypothesis.probability for hypothesis in hypotheses if not hypothesis.lost) > 0.9
 
 
-def test_scans_are_counted_on_and_odometry_begins_anew(office, begin):
-    run = carried(office, office.records[begin:], 25)
+def test_scans_are_counted_on_and_odometry_restarts(office, begin):
+    run = start_in_map(office, office.records[begin:], 25)
     assert run.state.processes["slam"].processed_scans == office.state.processes["slam"].processed_scans + 25
     assert run.state.processes["slam"].dropped_scans == 0
 
 
-def test_one_that_is_carried_while_it_maps_notices_and_is_recognized():
-    found = kidnapped(CARRIED)
+def test_one_that_is_kidnapped_while_it_maps_notices_and_is_recognized():
+    found = drive_kidnapped(CARRIED)
     assert found.noticed <= SOON
     assert found.again <= FAR
     assert not found.confident
     assert max(found.errors) < 0.1
 
 
-def test_one_that_is_carried_while_it_stores_nothing_notices_and_is_recognized(office):
+def test_one_that_is_kidnapped_while_it_stores_nothing_notices_and_is_recognized(office):
     run = LockStepRun(Configuration(mode="localization"), state=office.state)
     run.lock_step.feed(PoseReset())
     log = open_log(CARRIED)
     jump = START + int(0.6e9 * log.scenario.drive.duration)
-    heard = []
+    received = []
     for record in log.records():
         since = 1e-9 * (record.measurement.stamp - jump)
         if since > 40.0:
@@ -174,14 +174,16 @@ def test_one_that_is_carried_while_it_stores_nothing_notices_and_is_recognized(o
         if since > -30.0:
             run.process_record(record)
         if run.recorder.hypotheses:
-            lost = all(leaf.lost for leaf in run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses)
-            heard.append((since, lost))
-    assert not any(lost for since, lost in heard if -1.0 < since < 0.0)
-    assert any(lost for since, lost in heard if 0.0 < since < SOON)  # at 0.6 m/s at most
-    assert not heard[-1][1]
+            lost = all(
+                hypothesis.lost for hypothesis in run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
+            )
+            received.append((since, lost))
+    assert not any(lost for since, lost in received if -1.0 < since < 0.0)
+    assert any(lost for since, lost in received if 0.0 < since < SOON)  # at 0.6 m/s at most
+    assert not received[-1][1]
     assert run.state.processes["slam"].dropped_scans == 0
 
 
-def test_an_arc_that_tells_nothing_is_told_from_the_least_certain_one_between_areas():
+def test_an_arc_that_has_no_information_is_distinguished_from_the_least_certain_one_between_areas():
     assert is_uninformative(uninformative_belief(np.array([3.0, 4.0, 1.0])))
     assert not is_uninformative(PoseGaussian(np.zeros(3), np.diag([100.0, 100.0, 1.0]) ** 2))

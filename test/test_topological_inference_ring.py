@@ -12,7 +12,7 @@ DRIFT = np.array([0.002, -0.001, 0.0012])  # m, m, rad per keyframe
 
 
 def around_the_ring():
-    """Once around and a few metres further; the best hypothesis is accepted between cuts until the ring closes."""
+    """Once around and a few meters further; the best hypothesis is accepted between cuts until the ring closes."""
     run = Run(RING, DRIFT, field_of_view=2 * np.pi, beams=241)
     poses = ring_drive(112)
     for k, pose in enumerate(poses):
@@ -61,7 +61,7 @@ def test_the_arc_that_closes_the_ring_is_precise(ring):
     assert away @ np.linalg.solve(value.pose.covariance, away) < 16.3
 
 
-def test_two_runs_say_the_same_to_the_bit(ring):
+def test_two_runs_are_the_same_to_the_bit(ring):
     run, _ = ring
     again, _ = around_the_ring()
     for a, b in zip(run.answers, again.answers, strict=True):
@@ -74,10 +74,10 @@ def test_a_hypothesis_that_branched_has_children_with_new_ids(ring):
     run, _ = ring
     seen = set()
     for answer in run.answers:
-        parents = [leaf.parent for leaf in answer.hypotheses]
-        for leaf in answer.hypotheses:
-            if leaf.id != leaf.parent:
-                assert leaf.id not in seen
-            elif leaf.id == leaf.parent:
-                assert parents.count(leaf.parent) == 1
-        seen |= {leaf.id for leaf in answer.hypotheses}
+        parents = [child.parent for child in answer.hypotheses]
+        for child in answer.hypotheses:
+            if child.id != child.parent:
+                assert child.id not in seen
+            elif child.id == child.parent:
+                assert parents.count(child.parent) == 1
+        seen |= {child.id for child in answer.hypotheses}

@@ -19,8 +19,14 @@ def test_without_an_event_the_hypothesis_stays():
     run = Run(RING)
     answer = run.keyframe(np.array([3.0, 1.0, 0.0]))
     assert answer.hypotheses == (answer.hypotheses[0],)
-    leaf = answer.hypotheses[0]
-    assert (leaf.id, leaf.parent, leaf.probability, leaf.area, leaf.local_areas) == (0, 0, 1.0, 0, ())
+    hypothesis = answer.hypotheses[0]
+    assert (hypothesis.id, hypothesis.parent, hypothesis.probability, hypothesis.area, hypothesis.local_areas) == (
+        0,
+        0,
+        1.0,
+        0,
+        (),
+    )
 
 
 def test_a_cut_in_unknown_ground_makes_a_new_area():
@@ -28,15 +34,15 @@ def test_a_cut_in_unknown_ground_makes_a_new_area():
     poses = ring_drive(8)
     for pose in poses[:-1]:
         run.keyframe(pose)
-    (leaf,) = run.keyframe(poses[-1], cut=3).hypotheses
-    assert (leaf.id, leaf.area, leaf.probability) == (0, 1, 1.0)
-    assert [r.keyframe for r in leaf.moved_keyframes] == [5, 6, 7]
-    assert np.allclose(leaf.moved_keyframes[0].pose, 0.0)
-    assert np.allclose(leaf.moved_keyframes[2].pose, se2.between(poses[5], poses[7]))
-    (arc,) = leaf.arcs
+    (hypothesis,) = run.keyframe(poses[-1], cut=3).hypotheses
+    assert (hypothesis.id, hypothesis.area, hypothesis.probability) == (0, 1, 1.0)
+    assert [r.keyframe for r in hypothesis.moved_keyframes] == [5, 6, 7]
+    assert np.allclose(hypothesis.moved_keyframes[0].pose, 0.0)
+    assert np.allclose(hypothesis.moved_keyframes[2].pose, se2.between(poses[5], poses[7]))
+    (arc,) = hypothesis.arcs
     assert (arc.source, arc.target, arc.closure) == (0, 1, False)
     assert np.allclose(arc.pose.mean, se2.between(poses[0], poses[5]))
-    assert np.allclose(leaf.frame_change.mean, se2.between(poses[5], poses[0]))
+    assert np.allclose(hypothesis.frame_change.mean, se2.between(poses[5], poses[0]))
 
 
 def test_the_new_arc_has_the_uncertainty_of_the_reference_keyframe_and_the_floor():
@@ -46,19 +52,19 @@ def test_the_new_arc_has_the_uncertainty_of_the_reference_keyframe_and_the_floor
     at_reference = run.covariances[0].copy()
     for pose in ring_drive(9)[7:8]:
         run.keyframe(pose)
-    (leaf,) = run.keyframe(ring_drive(9)[8], cut=3).hypotheses
+    (hypothesis,) = run.keyframe(ring_drive(9)[8], cut=3).hypotheses
     floor = np.diag([0.01, 0.01, math.radians(0.2)]) ** 2
-    assert np.allclose(leaf.arcs[0].pose.covariance, at_reference + floor)
+    assert np.allclose(hypothesis.arcs[0].pose.covariance, at_reference + floor)
 
 
 def test_the_local_map_holds_the_area_and_those_that_are_surely_near():
     run = Run(RING)
     for pose in ring_drive(7):
         run.keyframe(pose)
-    (leaf,) = run.keyframe(ring_drive(8)[7], cut=3).hypotheses
-    assert [local.area for local in leaf.local_areas] == [1, 0]
-    assert np.allclose(leaf.local_areas[0].pose, 0.0)
-    assert np.allclose(leaf.local_areas[1].pose, leaf.frame_change.mean)
+    (hypothesis,) = run.keyframe(ring_drive(8)[7], cut=3).hypotheses
+    assert [local.area for local in hypothesis.local_areas] == [1, 0]
+    assert np.allclose(hypothesis.local_areas[0].pose, 0.0)
+    assert np.allclose(hypothesis.local_areas[1].pose, hypothesis.frame_change.mean)
 
 
 @pytest.mark.parametrize("mapping", [True, False])
@@ -69,10 +75,10 @@ def test_a_move_goes_to_the_known_area_and_no_keyframe_changes(mapping):
         run.keyframe(pose)
     run.keyframe(poses[-1], cut=3)
     before = run.poses[0]
-    (leaf,) = run.keyframe(poses[-1], moved=0, mapping=mapping).hypotheses
-    assert (leaf.id, leaf.area, leaf.moved_keyframes, leaf.arcs) == (0, 0, (), ())
-    assert [local.area for local in leaf.local_areas] == [0, 1]
-    assert np.allclose(se2.compose(leaf.frame_change.mean, before), se2.between(poses[0], poses[-1]))
+    (hypothesis,) = run.keyframe(poses[-1], moved=0, mapping=mapping).hypotheses
+    assert (hypothesis.id, hypothesis.area, hypothesis.moved_keyframes, hypothesis.arcs) == (0, 0, (), ())
+    assert [local.area for local in hypothesis.local_areas] == [0, 1]
+    assert np.allclose(se2.compose(hypothesis.frame_change.mean, before), se2.between(poses[0], poses[-1]))
 
 
 def two_areas(**changed):
@@ -88,12 +94,18 @@ def test_an_area_becomes_part_of_another_and_the_robot_goes_on_there():
     run, pose = two_areas()
     into = run.replica.maps[0].arc(0, 1)
     before = {k: se2.compose(into.mean, at) for k, at in run.replica.maps[0].keyframes(1).items()}
-    (leaf,) = run.keyframe(pose, merged=(1, 0)).hypotheses
-    assert (leaf.id, leaf.probability, leaf.area, leaf.moved_keyframes, leaf.arcs) == (0, 1.0, 0, (), ())
-    assert (leaf.area_merge.area, leaf.area_merge.into) == (1, 0)
-    assert [local.area for local in leaf.local_areas] == [0]
-    np.testing.assert_allclose(leaf.frame_change.mean, into.mean, atol=1e-12)
-    np.testing.assert_allclose(leaf.area_merge.pose.covariance, into.covariance, atol=1e-12)
+    (hypothesis,) = run.keyframe(pose, merged=(1, 0)).hypotheses
+    assert (hypothesis.id, hypothesis.probability, hypothesis.area, hypothesis.moved_keyframes, hypothesis.arcs) == (
+        0,
+        1.0,
+        0,
+        (),
+        (),
+    )
+    assert (hypothesis.area_merge.area, hypothesis.area_merge.into) == (1, 0)
+    assert [local.area for local in hypothesis.local_areas] == [0]
+    np.testing.assert_allclose(hypothesis.frame_change.mean, into.mean, atol=1e-12)
+    np.testing.assert_allclose(hypothesis.area_merge.pose.covariance, into.covariance, atol=1e-12)
     hybrid_map = run.replica.maps[0]
     assert hybrid_map.area_ids() == [0]
     assert list(hybrid_map.all_arcs()) == []
@@ -102,8 +114,8 @@ def test_an_area_becomes_part_of_another_and_the_robot_goes_on_there():
     # And is then left as any other.
     for further in ring_drive(16)[11:]:
         run.keyframe(further)
-    (leaf,) = run.keyframe(ring_drive(17)[16], cut=3).hypotheses
-    assert (leaf.area, leaf.arcs[0].source) == (2, 0)
+    (hypothesis,) = run.keyframe(ring_drive(17)[16], cut=3).hypotheses
+    assert (hypothesis.area, hypothesis.arcs[0].source) == (2, 0)
 
 
 def test_a_robot_that_is_in_neither_of_two_areas_stays_where_it_is():
@@ -111,18 +123,23 @@ def test_a_robot_that_is_in_neither_of_two_areas_stays_where_it_is():
     for further in ring_drive(20)[10:]:
         run.keyframe(further)
     run.keyframe(ring_drive(21)[20], cut=3)
-    (leaf,) = run.keyframe(ring_drive(22)[21], merged=(1, 0)).hypotheses
-    assert (leaf.area, leaf.frame_change, leaf.area_merge.into) == (2, None, 0)
-    assert leaf.local_areas[0].area == 2
-    assert 1 not in [local.area for local in leaf.local_areas]
+    (hypothesis,) = run.keyframe(ring_drive(22)[21], merged=(1, 0)).hypotheses
+    assert (hypothesis.area, hypothesis.frame_change, hypothesis.area_merge.into) == (2, None, 0)
+    assert hypothesis.local_areas[0].area == 2
+    assert 1 not in [local.area for local in hypothesis.local_areas]
     assert run.replica.maps[0].neighbors(2) == [0]
 
 
 def test_areas_whose_surfaces_contradict_each_other_stay_two():
     wrong = PoseGaussian(se2.compose(se2.between(*ring_drive(7)[[0, 6]]), [0.0, 0.6, 0.0]), STEP)
     run, pose = two_areas(arcs=(Arc(0, 1, wrong, closure=True),))
-    (leaf,) = run.keyframe(pose, merged=(1, 0)).hypotheses
-    assert (leaf.area, leaf.frame_change, leaf.area_merge, leaf.local_areas) == (1, None, None, ())
+    (hypothesis,) = run.keyframe(pose, merged=(1, 0)).hypotheses
+    assert (hypothesis.area, hypothesis.frame_change, hypothesis.area_merge, hypothesis.local_areas) == (
+        1,
+        None,
+        None,
+        (),
+    )
 
 
 def test_turning_back_into_tracked_ground_is_no_new_area():
@@ -134,9 +151,9 @@ def test_turning_back_into_tracked_ground_is_no_new_area():
     for pose in poses[2:6][::-1]:
         turned = np.array([pose[0], pose[1], math.pi])
         run.keyframe(turned)
-    (leaf,) = run.keyframe(np.array([*poses[1][:2], math.pi]), cut=5).hypotheses
-    assert (leaf.area, leaf.probability, leaf.arcs) == (0, 1.0, ())
-    assert {r.area for r in leaf.moved_keyframes} == {0}
+    (hypothesis,) = run.keyframe(np.array([*poses[1][:2], math.pi]), cut=5).hypotheses
+    assert (hypothesis.area, hypothesis.probability, hypothesis.arcs) == (0, 1.0, ())
+    assert {r.area for r in hypothesis.moved_keyframes} == {0}
 
 
 def test_ground_tracked_by_way_of_another_area_is_joined_by_a_measured_arc():
@@ -150,7 +167,7 @@ def test_ground_tracked_by_way_of_another_area_is_joined_by_a_measured_arc():
     assert run.replica.maps[0].arc(2, 0) is None
     run.stored = False
     answers = [run.keyframe(np.array([*poses[k][:2], math.pi])) for k in (14, 8, 2, 2, 2)]
-    (arc,) = [arc for answer in answers for leaf in answer.hypotheses for arc in leaf.arcs]
+    (arc,) = [arc for answer in answers for hypothesis in answer.hypotheses for arc in hypothesis.arcs]
     assert (arc.source, arc.target, arc.closure) == (2, 0, True)
     reference = min(run.replica.maps[0].keyframes(2))
     assert np.allclose(arc.pose.mean, se2.between(poses[reference], poses[0]), atol=0.03)
@@ -158,7 +175,7 @@ def test_ground_tracked_by_way_of_another_area_is_joined_by_a_measured_arc():
     assert answers[-1].hypotheses[0].probability == 1.0
 
 
-def ring_with_two_leaves(apart=1.0):
+def ring_with_two_hypotheses(apart=1.0):
     """Two live hypotheses that have the robot ``apart``, m, as TSBI would have made them."""
     run = Run(RING)
     run.keyframe(np.array([3.0, 1.0, 0.0]))
@@ -167,7 +184,7 @@ def ring_with_two_leaves(apart=1.0):
 
 
 def split_in_two(run, apart):
-    """Leaf 1 where the robot is, leaf 2 at the pose ``apart`` from there."""
+    """Hypothesis 1 where the robot is, hypothesis 2 at the pose ``apart`` from there."""
     split = Hypotheses(len(run.answers) - 1, (Hypothesis(1, 0, 0.6, 0), Hypothesis(2, 0, 0.4, 0)))
     for replica in (run.replica, run.tsbi._replica):
         replica.apply_hypotheses(split)
@@ -178,21 +195,21 @@ def split_in_two(run, apart):
 
 
 def test_the_evidence_of_the_scans_shifts_the_weights():
-    run = ring_with_two_leaves()
+    run = ring_with_two_hypotheses()
     first, second = sorted(run.poses)
     before = dict(run.replica.probabilities)
     run.evidence = {first: 0.0, second: 1.5}
     answer = run.keyframe(run.true_pose)
-    after = {leaf.id: leaf.probability for leaf in answer.hypotheses}
+    after = {hypothesis.id: hypothesis.probability for hypothesis in answer.hypotheses}
     assert after[second] / after[first] == pytest.approx(math.exp(1.5) * before[second] / before[first])
 
 
-def test_hypotheses_that_say_the_same_become_one_with_the_weight_of_both():
-    run = ring_with_two_leaves(apart=0.2)
+def test_hypotheses_that_are_equivalent_become_one_with_the_weight_of_both():
+    run = ring_with_two_hypotheses(apart=0.2)
     run.evidence = {1: 0.0, 2: 1.5}
-    (leaf,) = run.keyframe(run.true_pose).hypotheses
-    assert leaf.id == 2
-    assert leaf.probability == pytest.approx(1.0)
+    (hypothesis,) = run.keyframe(run.true_pose).hypotheses
+    assert hypothesis.id == 2
+    assert hypothesis.probability == pytest.approx(1.0)
 
 
 def odds_after_return(keyframes, apart):
@@ -204,7 +221,7 @@ def odds_after_return(keyframes, apart):
         run.keyframe(pose)
     run.keyframe(poses[4])
     split_in_two(run, np.array(apart))
-    first, second = (leaf.probability for leaf in run.keyframe(poses[5]).hypotheses)
+    first, second = (hypothesis.probability for hypothesis in run.keyframe(poses[5]).hypotheses)
     return first / second / 1.5
 
 
@@ -219,10 +236,10 @@ def test_what_was_seen_just_before_is_no_known_ground():
 
 
 def test_acceptance_leaves_one_hypothesis():
-    run = ring_with_two_leaves()
+    run = ring_with_two_hypotheses()
     run.accept(2)
-    (leaf,) = run.keyframe(run.true_pose).hypotheses
-    assert (leaf.id, leaf.parent, leaf.probability) == (2, 2, 1.0)
+    (hypothesis,) = run.keyframe(run.true_pose).hypotheses
+    assert (hypothesis.id, hypothesis.parent, hypothesis.probability) == (2, 2, 1.0)
 
 
 def test_the_local_map_takes_the_poses_of_the_global_map_where_they_agree():
@@ -237,8 +254,8 @@ def test_the_local_map_takes_the_poses_of_the_global_map_where_they_agree():
     run.accept(
         0, global_poses=(AreaPose(0, PoseGaussian(np.zeros(3), certain)), AreaPose(1, PoseGaussian(placed, certain)))
     )
-    (leaf,) = run.keyframe(poses[-1], moved=0).hypotheses
-    assert np.allclose(leaf.local_areas[1].pose, placed)
+    (hypothesis,) = run.keyframe(poses[-1], moved=0).hypotheses
+    assert np.allclose(hypothesis.local_areas[1].pose, placed)
 
 
 def test_events_of_another_keyframe_are_refused():

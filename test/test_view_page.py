@@ -1,4 +1,4 @@
-"""What the live page is told, and how it is served, without ROS and without a browser."""
+"""The data of the live page, and how it is served, without ROS and without a browser."""
 
 import http.client
 import io
@@ -52,7 +52,7 @@ def test_the_picture_of_a_grid_has_the_smallest_y_at_the_bottom_and_three_levels
     assert not picture[0].any()
 
 
-def test_a_browser_hears_of_what_changed_alone(board):
+def test_a_browser_receives_what_changed_alone(board):
     seen = ClientState()
     board.put("area", "3")
     board.put("localized", True)
@@ -63,7 +63,7 @@ def test_a_browser_hears_of_what_changed_alone(board):
     assert board.wait_for_changes(seen) == {"area": "4"}
 
 
-def test_the_history_comes_once_and_whole_where_it_began_anew(board):
+def test_the_history_comes_once_and_whole_where_it_restarted(board):
     one, other = ClientState(), ClientState()
     for event in range(3):
         board.append_event(event)
@@ -89,22 +89,22 @@ def head(sequence, stamp):
     return KeyframeHeader.from_keyframe(Keyframe(sequence, scan, 0.5 * sequence, ()))
 
 
-def test_events_are_told_once_in_order_when_both_halves_are_there_and_a_new_run_begins_anew(board):
+def test_events_are_reported_once_in_order_when_both_halves_are_there_and_a_new_run_restarts(board):
     history, seen = KeyframeHistory(board), ClientState()
 
-    def told(*messages):
+    def new_events(*messages):
         for message in messages:
             history.add(message)
         history.publish_complete()
-        news = board.wait_for_changes(seen).get("history", {"anew": False, "events": []})
-        return news["anew"], [event["event"] for event in news["events"]]
+        changes = board.wait_for_changes(seen).get("history", {"anew": False, "events": []})
+        return changes["anew"], [event["event"] for event in changes["events"]]
 
     answers = [Hypotheses(k, (Hypothesis(3, 0, 0.25, 5), Hypothesis(1, 0, 0.75, 4, lost=True))) for k in range(3)]
-    assert told(answers[1], answers[0]) == (True, [])
-    assert told(head(1, 7_000_000_000), head(0, 5_500_000_000)) == (False, [0, 1])
-    assert told(head(2, 9_000_000_000), answers[0], answers[1], head(0, 5_500_000_000)) == (False, [])
-    assert told(answers[2]) == (False, [2])
-    assert told(head(0, 20_000_000_000), answers[0]) == (True, [0])
+    assert new_events(answers[1], answers[0]) == (True, [])
+    assert new_events(head(1, 7_000_000_000), head(0, 5_500_000_000)) == (False, [0, 1])
+    assert new_events(head(2, 9_000_000_000), answers[0], answers[1], head(0, 5_500_000_000)) == (False, [])
+    assert new_events(answers[2]) == (False, [2])
+    assert new_events(head(0, 20_000_000_000), answers[0]) == (True, [0])
     (event,) = board.wait_for_changes(ClientState())["history"]["events"]
     assert event == {
         "event": 0,
@@ -115,7 +115,7 @@ def test_events_are_told_once_in_order_when_both_halves_are_there_and_a_new_run_
     }
 
 
-def test_the_page_its_style_and_its_scripts_are_served_and_ask_for_nothing_from_elsewhere(server):
+def test_the_page_its_style_and_its_scripts_are_served_and_request_nothing_from_elsewhere(server):
     for path, kind in (
         ("", "text/html"),
         ("view.css", "text/css"),
@@ -144,7 +144,7 @@ def test_the_map_is_sent_to_those_who_do_not_have_it(board, server):
         assert answer.status == 200
 
 
-def test_news_stream_and_somebody_who_looks_is_noticed(board, server):
+def test_messages_are_streamed_and_viewers_are_counted(board, server):
     assert not board.is_watched
     with urlopen(server.url + "news", timeout=10) as stream:
         assert json.loads(stream.readline().decode().removeprefix("data: "))["history"]["anew"]
@@ -167,7 +167,7 @@ def test_the_command_line_names_the_port_of_the_node():
     assert build_parser().parse_args(["replay", "log", "--out", "out"]).view is None
 
 
-def test_a_port_in_use_and_an_address_that_is_none_are_told_in_a_sentence(board):
+def test_a_port_in_use_and_an_address_that_is_none_are_reported_in_a_sentence(board):
     sentence = r"cannot listen on 127\.0\.0\.1, port \d+ .*give another port"
     with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(HmtSlamError, match=sentence):
         PageServer(board, "127.0.0.1", taken.getsockname()[1])
@@ -175,7 +175,7 @@ def test_a_port_in_use_and_an_address_that_is_none_are_told_in_a_sentence(board)
         PageServer(board, "here", 0)
 
 
-def test_browsers_beyond_the_twentieth_stream_are_told_so(server):
+def test_browsers_beyond_the_twentieth_stream_are_refused(server):
     port = int(server.url.rsplit(":", 1)[1].strip("/"))
     streams = [http.client.HTTPConnection("127.0.0.1", port, timeout=10) for _ in range(21)]
     for stream in streams:
@@ -226,8 +226,8 @@ def test_a_node_that_is_halted_is_named_rather_than_the_pose_that_does_not_come(
     health = SystemHealth(NODES)
     well(health, 0.0)
     health.update("rtl", 0, "inactive", {"state": "inactive"}, 0.0)
-    told = {"level": "waiting", "text": "rtl is inactive.", "advice": "ros2 lifecycle set /rtl activate"}
-    assert health.verdict(1.0) == told
+    new_events = {"level": "waiting", "text": "rtl is inactive.", "advice": "ros2 lifecycle set /rtl activate"}
+    assert health.verdict(1.0) == new_events
     assert health.rows(1.0)[1]["level"] == "waiting"
     health.update("rtl", 0, "running", {"state": "active"}, 1.0)
     assert "no pose came yet" in health.verdict(2.0)["text"]

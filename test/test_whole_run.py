@@ -22,7 +22,7 @@ LOG = Path(__file__).parents[1] / "data" / "malaga_one_loop"
 SCANS = 225
 
 
-def mapped(folder, *options):
+def run_map(folder, *options):
     command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(LOG), "--out", str(folder), *options]
     subprocess.run(command, check=True, timeout=300)
     return folder
@@ -30,7 +30,7 @@ def mapped(folder, *options):
 
 @pytest.fixture(scope="module")
 def output(tmp_path_factory):
-    return mapped(tmp_path_factory.mktemp("runs") / "first")
+    return run_map(tmp_path_factory.mktemp("runs") / "first")
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_every_scan_is_accounted_for(output, report):
     assert len(read_tum(output / "trajectory_online.tum").stamps) == SCANS
 
 
-def test_the_loop_becomes_several_areas_and_its_end_is_recognised(report):
+def test_the_loop_becomes_several_areas_and_its_end_is_recognized(report):
     assert report["areas"] >= 3
     assert report["loop_closures"] >= 1
     assert report["hypotheses"]["probability"] > 0.99
@@ -92,7 +92,7 @@ def revisit_overlap(output, shift=(0.0, 0.0, 0.0)):
     return np.median(shares)
 
 
-def test_where_the_robot_drives_its_first_metres_again_the_walls_are_single(output):
+def test_where_the_robot_drives_its_first_meters_again_the_walls_are_single(output):
     overlap = revisit_overlap(output)
     assert overlap > 0.75
     for shift in [(0.0, 0.1, 0.0), (0.1, 0.0, 0.0), (0.0, 0.0, 0.03)]:
@@ -100,7 +100,7 @@ def test_where_the_robot_drives_its_first_metres_again_the_walls_are_single(outp
 
 
 def test_one_seed_gives_the_same_bytes(output, tmp_path):
-    again = mapped(tmp_path / "again")
+    again = run_map(tmp_path / "again")
     names = ["trajectory.tum", "trajectory_online.tum", "graph.g2o", "map.pgm", "pmf.csv"]
     names += [str(p.relative_to(output)) for p in sorted((output / "hmt_map").rglob("*")) if p.is_file()]
     assert len(names) > 10
@@ -108,6 +108,6 @@ def test_one_seed_gives_the_same_bytes(output, tmp_path):
 
 
 def test_another_seed_gives_nearly_the_same_path(output, tmp_path):
-    other = mapped(tmp_path / "other", "--seed", "1")
+    other = run_map(tmp_path / "other", "--seed", "1")
     difference = se2.between(read_tum(output / "trajectory.tum").poses, read_tum(other / "trajectory.tum").poses)
     assert np.hypot(*difference[:, :2].T).max() < 0.1

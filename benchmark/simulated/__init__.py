@@ -1,1 +1,1 @@
-"""Runs on simulated worlds that are watched from outside, and what they were judged by: the truth."""
+"""Runs on simulated worlds, compared with the truth from outside."""

@@ -1,4 +1,4 @@
-"""Which loops the live hypotheses close, how right each of these closures is, and which are accepted."""
+"""Loop closures of the live hypotheses, their errors, and the accepted ones."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from benchmark.simulated.examinations import Examination, known_is_right, new_is_right
-from benchmark.simulated.truth import Claim, Truth
+from benchmark.simulated.truth import PlacementError, Truth
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.map_changes import Arc
 from hmt_slam_ros.messages.messages import Hypotheses, Hypothesis
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 
-# Keyframes of the robot's area by which it is judged that this area joins another.
+# Newest keyframes of the robot's area that are compared with a known area.
 _RECENT = 5
 
 
@@ -24,22 +24,22 @@ class Closure:
     :ivar event: the keyframe event.
     :ivar way: "cut" or "recheck" where it was one of several answers; "tracked" where the robot was known to be there.
     :ivar areas: the area that the robot was in, and the known one.
-    :ivar claim: how right that is.
+    :ivar assess: how right that is.
     """
 
     event: int
     way: str
     areas: tuple[int, int]
-    claim: Claim
+    assessment: PlacementError
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """What there is to say of a live hypothesis.
+    """The closures of a live hypothesis, compared with the truth.
 
-    :ivar wrong: whether it closed a loop that there is not, since the last time that a path was accepted.
-    :ivar missing: whether its last answer was new ground where there was a known place.
-    :ivar closures: those that are not accepted yet.
+    :ivar wrong: whether it closed a false loop since the last acceptance.
+    :ivar missing: whether its last answer was new ground instead of a known place.
+    :ivar closures: that are not accepted yet.
     """
 
     wrong: bool = False
@@ -53,93 +53,102 @@ class Path:
 
 
 class Paths:
-    """Follows the live hypotheses."""
+    """The paths of the live hypotheses."""
 
     def __init__(self, truth: Truth) -> None:
         self._truth = truth
         self.paths: Mapping[int, Path] = {FIRST_HYPOTHESIS: Path()}
 
-    def follow(self, hypotheses: Hypotheses, replica: Replica, asked: Mapping[int, Examination]) -> None:
-        """Learn of TSBI's answer.
+    def follow(self, hypotheses: Hypotheses, replica: Replica, examinations: Mapping[int, Examination]) -> None:
+        """Update the paths by TSBI's answer.
 
-        :param replica: as it was before.
-        :param asked: {parent: what it asked at this event}.
+        :param replica: before the answer.
+        :param examinations: {parent: its examination at this event}.
         """
         self.paths = {
-            leaf.id: self._followed(leaf, hypotheses.sequence, replica.maps[leaf.parent], asked)
-            for leaf in hypotheses.hypotheses
+            hypothesis.id: self._continue(
+                hypothesis, hypotheses.sequence, replica.maps[hypothesis.parent], examinations
+            )
+            for hypothesis in hypotheses.hypotheses
         }
 
-    def _followed(self, leaf: Hypothesis, event: int, before: HybridMap, asked: Mapping[int, Examination]) -> Path:
-        path = self.paths[leaf.parent]
-        examination = asked.get(leaf.parent)
-        found = [self._closure(leaf, arc, event, before, examination) for arc in closing(leaf, before, examination)]
-        path = replace(path, closures=(*path.closures, *found))
-        path = replace(path, wrong=path.wrong or not all(closure.claim.true for closure in found))
+    def _continue(
+        self, hypothesis: Hypothesis, event: int, before: HybridMap, examinations: Mapping[int, Examination]
+    ) -> Path:
+        path = self.paths[hypothesis.parent]
+        examination = examinations.get(hypothesis.parent)
+        closures = [
+            self._closure(hypothesis, arc, event, before, examination)
+            for arc in closing_arcs(hypothesis, before, examination)
+        ]
+        path = replace(path, closures=(*path.closures, *closures))
+        path = replace(path, wrong=path.wrong or not all(closure.assessment.true for closure in closures))
         if examination is None:
             return path
-        return replace(path, missing=not found and not new_is_right(examination, self._truth))
+        return replace(path, missing=not closures and not new_is_right(examination, self._truth))
 
     def _closure(
-        self, leaf: Hypothesis, arc: Arc, event: int, before: HybridMap, examination: Examination | None
+        self, hypothesis: Hypothesis, arc: Arc, event: int, before: HybridMap, examination: Examination | None
     ) -> Closure:
-        known_area = known_end(leaf, arc)
+        known_area = known_end(hypothesis, arc)
         other, pose = (arc.source, arc.pose.inverse()) if arc.target == known_area else (arc.target, arc.pose)
-        joined = {
-            r.keyframe: r.pose for r in leaf.moved_keyframes if r.area == known_area and r.previous_area != r.area
+        moved_keyframes = {
+            r.keyframe: r.pose for r in hypothesis.moved_keyframes if r.area == known_area and r.previous_area != r.area
         }
-        recent = examination.keyframes if examination else list(before.keyframes(other))[-_RECENT:]
-        staying = {k: se2.compose(pose.mean, at) for k, at in before.keyframes(other).items() if k in recent}
-        known, asked = before.keyframes(known_area), joined or staying
-        claim = self._truth.claim(known, asked, pose.covariance, pose.mean)
+        recent_keyframes = examination.keyframes if examination else list(before.keyframes(other))[-_RECENT:]
+        recent_poses = {
+            k: se2.compose(pose.mean, at) for k, at in before.keyframes(other).items() if k in recent_keyframes
+        }
+        known, query = before.keyframes(known_area), moved_keyframes or recent_poses
+        assessment = self._truth.assess(known, query, pose.covariance, pose.mean)
         way = examination.kind if examination else "tracked"
-        return Closure(event, way, (other, known_area), claim)
+        return Closure(event, way, (other, known_area), assessment)
 
-    def accepted(self, hypothesis: int, chosen: HybridMap) -> list[Closure]:
-        """The closures that become definite with a hypothesis, judged as they now are."""
+    def take_accepted(self, hypothesis: int, chosen: HybridMap) -> list[Closure]:
+        """The closures that become definite with a hypothesis, with their current errors."""
         path = self.paths[hypothesis]
         self.paths = {hypothesis: replace(path, wrong=False, closures=())}
-        return [self._judged_again(closure, chosen) for closure in path.closures]
+        return [self._reassess(closure, chosen) for closure in path.closures]
 
-    def _judged_again(self, closure: Closure, chosen: HybridMap) -> Closure:
-        """By the same keyframes; where one of them left the two areas, the verdict stands."""
+    def _reassess(self, closure: Closure, chosen: HybridMap) -> Closure:
+        """The closure with its current error by the same keyframes; unchanged if one of them left the two areas."""
         other, known_area = closure.areas
-        known, asked = closure.claim.pair
+        known, query = closure.assessment.pair
         pose = chosen.arc(known_area, other)
         ours, theirs = chosen.keyframes(known_area), chosen.keyframes(other)
-        if pose is None or known not in ours or asked not in {*ours, *theirs}:
+        if pose is None or known not in ours or query not in {*ours, *theirs}:
             return closure
-        at = ours[asked] if asked in ours else se2.compose(pose.mean, theirs[asked])
-        claim = self._truth.claim({known: ours[known]}, {asked: at}, pose.covariance, pose.mean)
-        return replace(closure, claim=claim)
+        at = ours[query] if query in ours else se2.compose(pose.mean, theirs[query])
+        assessment = self._truth.assess({known: ours[known]}, {query: at}, pose.covariance, pose.mean)
+        return replace(closure, assessment=assessment)
 
 
-def closing(leaf: Hypothesis, before: HybridMap, examination: Examination | None) -> Iterator[Arc]:
-    """The arcs by which a leaf says where in a known area the robot is.
+def closing_arcs(hypothesis: Hypothesis, before: HybridMap, examination: Examination | None) -> Iterator[Arc]:
+    """The arcs of a hypothesis that place the robot in a known area.
 
-    They close a loop that its parent had not closed, or are measured anew by keyframes that TSBI found in the area.
+    They close a new loop, or have a new measurement by keyframes that TSBI matched with the area.
     """
-    if leaf.removed_arcs:
-        return  # a question that TLCA opened again: nothing was observed
-    found = examination is not None and bool(leaf.moved_keyframes) and leaf.area in before.area_ids()
-    for arc in leaf.arcs:
+    if hypothesis.removed_arcs:
+        return  # a revision by TLCA, without an observation
+    found = examination is not None and bool(hypothesis.moved_keyframes) and hypothesis.area in before.area_ids()
+    for arc in hypothesis.arcs:
         value = before.arc_value(arc.source, arc.target)
         if found or (arc.closure and (value is None or not value.closure)):
             yield arc
 
 
-def known_end(leaf: Hypothesis, arc: Arc) -> int:
-    """The known one of the two areas of an arc: that which keyframes moved to, else that in which the robot is not."""
-    if leaf.moved_keyframes:
-        return leaf.area
-    return arc.target if arc.source == leaf.area else arc.source
+def known_end(hypothesis: Hypothesis, arc: Arc) -> int:
+    """The known area of an arc: the one that keyframes moved to, else the one without the robot."""
+    if hypothesis.moved_keyframes:
+        return hypothesis.area
+    return arc.target if arc.source == hypothesis.area else arc.source
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a forecast says of one answer to "in which known area are these keyframes?".
+    """The probability of one answer to the question in which known area keyframes lie.
 
-    :ivar area: the known area, -1 for none, -2 for what a hypothesis is that did not ask.
+    :ivar area: the known area, ``NEW`` for none, ``NOT_EXAMINED`` for a hypothesis without an examination.
     :ivar probability: of the forecast.
     :ivar right: whether the answer is true.
     """
@@ -149,32 +158,32 @@ class Answer:
     right: bool
 
 
-NEW, NOT_ASKED = -1, -2
+NEW, NOT_EXAMINED = -1, -2
 
 
-def answers(
-    hypotheses: Hypotheses, before: Replica, asked: Mapping[int, Examination], paths: Mapping[int, Path]
+def live_answers(
+    hypotheses: Hypotheses, before: Replica, examinations: Mapping[int, Examination], paths: Mapping[int, Path]
 ) -> list[Answer]:
-    """The PMF over the live hypotheses after an event, by what each answered.
+    """The answers of the live hypotheses after an event, with the probability of each.
 
     :param paths: after the event.
     """
     found = []
-    for leaf in hypotheses.hypotheses:
-        examination = asked.get(leaf.parent)
-        arcs = list(closing(leaf, before.maps[leaf.parent], examination))
-        area = NOT_ASKED if examination is None else known_end(leaf, arcs[0]) if arcs else NEW
-        found.append(Answer(area, leaf.probability, paths[leaf.id].right))
+    for hypothesis in hypotheses.hypotheses:
+        examination = examinations.get(hypothesis.parent)
+        arcs = list(closing_arcs(hypothesis, before.maps[hypothesis.parent], examination))
+        area = NOT_EXAMINED if examination is None else known_end(hypothesis, arcs[0]) if arcs else NEW
+        found.append(Answer(area, hypothesis.probability, paths[hypothesis.id].right))
     return found
 
 
-def by_arcs_alone(
+def answers_by_arcs(
     hypotheses: Iterable[tuple[int, float]],
-    asked: Mapping[int, Examination],
+    examinations: Mapping[int, Examination],
     paths: Mapping[int, Path],
     truth: Truth,
 ) -> list[tuple[Answer, int]]:
-    """The forecast of one who knows the arcs but looks at no scan, with the number of its known areas.
+    """The answers by the arcs alone, without scans, each with the number of known areas.
 
     :param hypotheses: (id, probability) before the event.
     :param paths: before the event.
@@ -182,10 +191,10 @@ def by_arcs_alone(
     found = []
     for hypothesis, probability in hypotheses:
         wrong = paths[hypothesis].wrong
-        if hypothesis not in asked:
-            found.append((Answer(NOT_ASKED, probability, paths[hypothesis].right), 0))
+        if hypothesis not in examinations:
+            found.append((Answer(NOT_EXAMINED, probability, paths[hypothesis].right), 0))
             continue
-        examination = asked[hypothesis]
+        examination = examinations[hypothesis]
         model = examination.found.transition
         right = not wrong and new_is_right(examination, truth)
         found.append((Answer(NEW, probability * model.new, right), len(model.known)))

@@ -1,4 +1,4 @@
-"""Comparisons of keyframes with known areas, as TSBI makes them, and the truth of each: data to fit the model on."""
+"""TSBI's comparisons of keyframes with known areas, with the truth of each: data to fit the model."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmark.simulated.truth import GREY, RADIUS, Pose, Truth
+from benchmark.simulated.truth import RADIUS, TOLERANCE, Pose, Truth
 from hmt_slam_ros import composition
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
@@ -28,7 +28,7 @@ from hmt_slam_ros.topological_inference.branching import Branches, Branching, Pa
 from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch, Fit
 from hmt_slam_ros.topological_inference.place_recognition import ScanDescriptors, descriptor_log_ratio
 
-_Asked = tuple[Query, Mapping[int, Collection[int]], frozenset[int], AreaComparison]
+_Comparison = tuple[Query, Mapping[int, Collection[int]], frozenset[int], AreaComparison]
 _VIEWS = 3
 _NAN = math.nan
 _NO_MATCH = (0, _NAN, 0, 0)
@@ -36,16 +36,16 @@ _NO_MATCH = (0, _NAN, 0, 0)
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """One hypothesis's keyframes, compared with its known areas.
+    """The comparison of a hypothesis's keyframes with its known areas.
 
     :ivar kind: "cut" or "recheck".
     :ivar parent: the hypothesis before the event.
     :ivar query: its keyframes in question.
-    :ivar compared: {known area: keyframes that had been compared with it before}.
-    :ivar excluded: areas that were neither candidates nor part of a candidate's map.
-    :ivar found: what came of it.
-    :ivar views: grids of keyframes and areas, as the search builds them.
-    :ivar looks: of keyframes.
+    :ivar compared: {known area: keyframes that were compared with it before}.
+    :ivar excluded: areas that are neither candidates nor part of a candidate's map.
+    :ivar found: result of the comparison.
+    :ivar views: grids of keyframes and areas of the search.
+    :ivar descriptors: of keyframes.
     """
 
     kind: str
@@ -55,7 +55,7 @@ class Examination:
     excluded: frozenset[int]
     found: AreaComparison
     views: GridCache
-    looks: ScanDescriptors
+    descriptors: ScanDescriptors
 
     @property
     def hybrid_map(self) -> HybridMap:
@@ -72,7 +72,7 @@ class Examination:
         """All areas in which the keyframes could have been found."""
         return [area for area in self.hybrid_map.area_ids() if area not in self.excluded]
 
-    def fresh(self, area: int) -> dict[int, Pose]:
+    def unmatched_keyframes(self, area: int) -> dict[int, Pose]:
         """{keyframe: ``reference_T_base``} of those not compared with an area before."""
         return {k: pose for k, pose in self.query.poses.items() if k not in self.compared.get(area, ())}
 
@@ -81,44 +81,44 @@ class Examination:
         return self.views.place(self.hybrid_map, area, self.excluded).grid
 
 
-Heard = Callable[[Examination], None]
+ExaminationListener = Callable[[Examination], None]
 
 
-class WatchedBranching(Branching):
-    """Makes the children of hypotheses, as always, and tells what they were made from."""
+class ObservedBranching(Branching):
+    """A branching that passes its examinations to a listener."""
 
-    def __init__(self, configuration: Configuration, replica: Replica, heard: Heard) -> None:
+    def __init__(self, configuration: Configuration, replica: Replica, listener: ExaminationListener) -> None:
         super().__init__(configuration, replica, composition.landmark_evidence)
-        self.search = self._watched = _WatchedSearch(configuration, replica.scans)
-        self._looks = ScanDescriptors(replica.scans)
-        self._heard = heard
+        self.search = self._observed_search = _ObservedSearch(configuration, replica.scans)
+        self._descriptors = ScanDescriptors(replica.scans)
+        self._listener = listener
 
     def cut(self, parent: Parent, keyframes: Sequence[int]) -> Branches:
-        """As always."""
-        return self._told("cut", parent, super().cut(parent, keyframes))
+        """As of the base class, with the listener."""
+        return self._report("cut", parent, super().cut(parent, keyframes))
 
     def recheck(self, parent: Parent, only: Collection[int] = ()) -> Branches:
-        """As always."""
-        return self._told("recheck", parent, super().recheck(parent, only))
+        """As of the base class, with the listener."""
+        return self._report("recheck", parent, super().recheck(parent, only))
 
-    def _told(self, kind: str, parent: Parent, branches: Branches) -> Branches:
-        if (asked := self._watched.take()) is not None:
-            query, compared, excluded, found = asked
-            views = self._watched.views
-            self._heard(Examination(kind, parent, query, compared, excluded, found, views, self._looks))
+    def _report(self, kind: str, parent: Parent, branches: Branches) -> Branches:
+        if (comparison := self._observed_search.take()) is not None:
+            query, compared, excluded, found = comparison
+            views = self._observed_search.views
+            self._listener(Examination(kind, parent, query, compared, excluded, found, views, self._descriptors))
         return branches
 
 
-class _WatchedSearch(ClosureSearch):
-    """Remembers its last comparison."""
+class _ObservedSearch(ClosureSearch):
+    """A closure search that keeps its last comparison."""
 
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
         super().__init__(configuration, scans)
-        self._last: _Asked | None = None
+        self._last: _Comparison | None = None
 
     @property
     def views(self) -> GridCache:
-        """Grids that were built and are kept."""
+        """Cached grids."""
         return self._grid_cache
 
     def compare(
@@ -131,21 +131,21 @@ class _WatchedSearch(ClosureSearch):
         most: int,
         only: Collection[int] = (),
     ) -> AreaComparison:
-        """As always."""
+        """As of the base class, with the listener."""
         found = super().compare(hybrid_map, area, query, compared, excluded, most, only)
         self._last = query, compared, frozenset(excluded), found
         return found
 
-    def take(self) -> _Asked | None:
-        """The last comparison since it was taken."""
+    def take(self) -> _Comparison | None:
+        """Return and forget the last comparison."""
         last, self._last = self._last, None
         return last
 
 
 class Match(NamedTuple):
-    """How surface samples lie in a map.
+    """The match of surface samples with a map.
 
-    :ivar samples: how many there are.
+    :ivar samples: number of samples.
     :ivar score: sum of their log-ratios, not tempered, nats.
     :ivar on: samples on known surfaces.
     :ivar free: samples in space that is known to be free.
@@ -158,20 +158,20 @@ class Match(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One mode in one known area, or that there is none (``mode`` -1).
+    """A mode in a known area; ``mode`` is -1 if there is none.
 
     :ivar event: the keyframe event.
     :ivar kind: 0 for a cut, 1 for a re-check.
-    :ivar hypothesis: that asks; ``log_probability``, its own, the newest scan counted.
-    :ivar area: that the keyframes are in.
-    :ivar known: the area that they are compared with.
+    :ivar hypothesis: parent; ``log_probability``, its own, including the newest scan.
+    :ivar area: of the keyframes.
+    :ivar known: area that they are compared with.
     :ivar mode: number of the mode, the heaviest first.
-    :ivar travelled: path length since the start, m.
+    :ivar traveled: path length since the start, m.
     :ivar loop: path driven since the known area's newest keyframe, m.
-    :ivar asked: number of the keyframes in question, those not compared with the area before.
+    :ivar query_size: number of keyframes that were not compared with the area before.
     :ivar keyframes: number of the known area's own.
     :ivar share: pi of the area by itself; ``pi``, in the transition model; ``new``, of new ground there.
-    :ivar look: log p(phi), nats, which is no part of the weight.
+    :ivar descriptor: log p(phi), nats, which is not part of the weight.
     :ivar log_mass: log of the mode's part of the evidence integral, nats.
     :ivar log_weight: of the fit, relative to new ground.
     :ivar prior_x: deviation of the prior by the arcs along its axes, widened; likewise ``prior_y`` (m), ``prior_turn``
@@ -183,11 +183,11 @@ class Row(NamedTuple):
     :ivar samples: to ``free``: the keyframes' samples in the area's map at the mode, as :class:`Match`.
     :ivar reverse_samples: to ``back_free``: the area's samples in the keyframes' map there.
     :ivar true_score: to ``true_free``: as ``score``, at the true pose; NaN where the places are not the same.
-    :ivar right: 1 where the claim is true, 0 where it is false.
-    :ivar apart: to ``error_turn``: of the claim, m, m, degrees.
+    :ivar right: 1 for a true mode, 0 for a false one.
+    :ivar apart: to ``error_turn``: of its error, m, m, degrees.
     :ivar in_place: share of the keyframes that truly are in the area's place.
-    :ivar known_right: whether it is right to say that they are; ``new_right``, that they are in no known place.
-    :ivar view: share of what the middle keyframe saw that the area's nearest ones saw too.
+    :ivar known_right: whether "in the area" is a right answer; ``new_right``, whether "new ground" is.
+    :ivar view: share of the middle keyframe's view that the nearest ones of the area have too.
     """
 
     event: int
@@ -197,14 +197,14 @@ class Row(NamedTuple):
     area: int
     known: int
     mode: int
-    travelled: float
+    traveled: float
     loop: float
-    asked: int
+    query_size: int
     keyframes: int
     share: float
     pi: float
     new: float
-    look: float
+    descriptor: float
     log_mass: float
     log_weight: float
     prior_x: float
@@ -237,18 +237,18 @@ class Row(NamedTuple):
     view: float
 
 
-def rows(
-    examination: Examination, truth: Truth, configuration: Configuration, event: int, travelled: dict[int, float]
+def examination_rows(
+    examination: Examination, truth: Truth, configuration: Configuration, event: int, traveled: dict[int, float]
 ) -> Iterator[Row]:
-    """The rows of one examination.
+    """The rows of an examination.
 
-    :param travelled: {keyframe: path length since the start, m}.
+    :param traveled: {keyframe: path length since the start, m}.
     """
     new = int(new_is_right(examination, truth))
     for known in examination.found.examined_areas:
         fits = [fit for fit in examination.found.fits if fit.area == known]
         candidate = _Candidate(examination, truth, configuration, known)
-        ours = travelled[event] - max(travelled[k] for k in examination.hybrid_map.keyframes(known))
+        loop = traveled[event] - max(traveled[k] for k in examination.hybrid_map.keyframes(known))
         head = (
             event,
             int(examination.kind == "recheck"),
@@ -257,59 +257,71 @@ def rows(
             examination.parent.area,
             known,
         )
-        middle = (travelled[event], ours, len(candidate.fresh), len(candidate.known), *candidate.transition())
+        middle = (traveled[event], loop, len(candidate.unmatched), len(candidate.known), *candidate.transition())
         for mode, fit in enumerate(fits) if fits else [(-1, None)]:
-            yield Row._make((*head, mode, *middle, *candidate.of(fit), *candidate.place_truth(), new, candidate.view()))
+            yield Row._make(
+                (*head, mode, *middle, *candidate.mode_values(fit), *candidate.place_truth(), new, candidate.view())
+            )
 
 
 def new_is_right(examination: Examination, truth: Truth) -> bool:
-    """Whether it is right to say that the keyframes lie in no known place: most of them do not."""
+    """Whether new ground is a right answer, because most of the keyframes lie in no known place."""
     known = [k for area in examination.known_areas for k in examination.hybrid_map.keyframes(area)]
-    return 2.0 * truth.share_in(examination.keyframes, known, (1.0 - GREY) * RADIUS) < 1.0
+    return 2.0 * truth.share_in(examination.keyframes, known, (1.0 - TOLERANCE) * RADIUS) < 1.0
 
 
 def known_is_right(examination: Examination, truth: Truth, area: int) -> bool:
-    """Whether it is right to say that the keyframes lie in a known area's place."""
+    """Whether a known area is a right answer, because most of the keyframes lie in its place."""
     known = list(examination.hybrid_map.keyframes(area))
-    return 2.0 * truth.share_in(examination.keyframes, known, (1.0 + GREY) * RADIUS) >= 1.0
+    return 2.0 * truth.share_in(examination.keyframes, known, (1.0 + TOLERANCE) * RADIUS) >= 1.0
 
 
 class _Candidate:
-    """A known area that the keyframes were compared with."""
+    """A known area that the keyframes were compared with, and its columns."""
 
     def __init__(self, examination: Examination, truth: Truth, configuration: Configuration, area: int) -> None:
-        self._asked, self._truth, self._options, self._area = examination, truth, configuration.tsbi, area
-        self.fresh = examination.fresh(area)
+        self._examination, self._truth, self._options, self._area = examination, truth, configuration.tsbi, area
+        self.unmatched = examination.unmatched_keyframes(area)
         self.known = examination.hybrid_map.keyframes(area)
         belief = shortest_path_beliefs(examination.hybrid_map, examination.parent.area)[area]
         prior = belief.inverse().compose(examination.query.belief)
         self._prior = PoseGaussian(prior.mean, self._options.prior_scale**2 * prior.covariance)
         self._place = examination.views.place(examination.hybrid_map, area, examination.excluded)
-        self._grid = examination.views.grid(self.fresh)
+        self._grid = examination.views.grid(self.unmatched)
 
     def transition(self) -> tuple[float, float, float]:
         """Share, pi and the probability of new ground."""
-        poses = np.array(list(self.fresh.values()))
+        poses = np.array(list(self.unmatched.values()))
         share = entry_prior(self._place, self._prior, poses, self._options.place_radius).probability
-        model = self._asked.found.transition
+        model = self._examination.found.transition
         return share, model.known[self._area], model.new
 
-    def of(self, fit: Fit | None) -> tuple[float, ...]:
-        """All that there is to say of a mode."""
+    def mode_values(self, fit: Fit | None) -> tuple[float, ...]:
+        """The columns of a mode."""
         deviations = np.sqrt(np.diag(self._prior.covariance))
-        look = self._look()
+        descriptor = self._descriptor_log_ratio()
         if fit is None:
-            nothing = [_NAN] * 2
-            shapes = [_NAN] * 6
-            return (look, *nothing, *deviations, *shapes, *_NO_MATCH, *_NO_MATCH, *self._at_truth(), 0, *[_NAN] * 3)
+            no_weights = [_NAN] * 2
+            no_shapes = [_NAN] * 6
+            return (
+                descriptor,
+                *no_weights,
+                *deviations,
+                *no_shapes,
+                *_NO_MATCH,
+                *_NO_MATCH,
+                *self._at_truth(),
+                0,
+                *[_NAN] * 3,
+            )
         at = fit.mode.pose.mean
-        away = se2.log(se2.between(self._prior.mean, at))
-        mahalanobis2 = float(away @ np.linalg.solve(self._prior.covariance, away))
+        offset = se2.log(se2.between(self._prior.mean, at))
+        mahalanobis2 = float(offset @ np.linalg.solve(self._prior.covariance, offset))
         log_determinant = float(np.linalg.slogdet(self._prior.covariance)[1])
         log_prior = -0.5 * (mahalanobis2 + log_determinant) - 1.5 * math.log(2.0 * math.pi)
         measured = fit.mode.measured.covariance
         return (
-            look,
+            descriptor,
             fit.mode.log_mass,
             fit.log_weight,
             *deviations,
@@ -320,50 +332,50 @@ class _Candidate:
             *_match(self._grid.points, at, self._place.grid),
             *_match(self._place.grid.points, se2.inverse(at), self._grid),
             *self._at_truth(),
-            *self._claim(fit),
+            *self._assessment(fit),
         )
 
-    def _claim(self, fit: Fit) -> tuple[float, ...]:
-        asked = {k: se2.compose(fit.mode.pose.mean, pose) for k, pose in self._asked.query.poses.items()}
+    def _assessment(self, fit: Fit) -> tuple[float, ...]:
+        query = {k: se2.compose(fit.mode.pose.mean, pose) for k, pose in self._examination.query.poses.items()}
         measured = fit.mode.measured
-        claim = self._truth.claim(self.known, asked, measured.covariance, measured.mean)
-        return int(claim.true), claim.apart, claim.translation, claim.rotation
+        assessment = self._truth.assess(self.known, query, measured.covariance, measured.mean)
+        return int(assessment.true), assessment.apart, assessment.translation, assessment.rotation
 
     def _at_truth(self) -> tuple[float, float, float]:
         """Score, samples on surfaces and in free space at the true pose."""
         nearest, pose = self._nearest()
-        if not self._truth.same_place(list(self.fresh), [nearest], RADIUS).any():
+        if not self._truth.same_place(list(self.unmatched), [nearest], RADIUS).any():
             return _NAN, _NAN, _NAN
         return _match(self._grid.points, pose, self._place.grid)[1:]
 
     def _nearest(self) -> tuple[int, Pose]:
-        """The area's keyframe nearest to the reference, and ``area_T_reference`` as it follows from there."""
-        reference = self._truth.poses[self._asked.keyframes[0]]
+        """The area's keyframe nearest to the reference, and ``area_T_reference`` by that keyframe."""
+        reference = self._truth.poses[self._examination.keyframes[0]]
         nearest = min(self.known, key=lambda k: float(np.hypot(*(self._truth.poses[k] - reference)[:2])))
         return nearest, se2.compose(self.known[nearest], se2.between(self._truth.poses[nearest], reference))
 
     def place_truth(self) -> tuple[float, int]:
-        """Share of the keyframes in the area's place, and whether it is right to say that they are."""
-        share = self._truth.share_in(self._asked.keyframes, list(self.known), RADIUS)
-        return share, int(known_is_right(self._asked, self._truth, self._area))
+        """Share of the keyframes in the area's place, and whether the area is a right answer."""
+        share = self._truth.share_in(self._examination.keyframes, list(self.known), RADIUS)
+        return share, int(known_is_right(self._examination, self._truth, self._area))
 
     def view(self) -> float:
-        """Of what the middle keyframe saw, the largest share that one of the area's nearest saw too."""
-        keyframes = list(self.fresh)
+        """Largest share of the middle keyframe's view that one of the area's nearest keyframes has too."""
+        keyframes = list(self.unmatched)
         middle = keyframes[len(keyframes) // 2]
         here = self._truth.poses[middle]
         near = sorted(self.known, key=lambda k: float(np.hypot(*(self._truth.poses[k] - here)[:2])))[:_VIEWS]
         return float(self._truth.shared_view(middle, near).max())
 
-    def _look(self) -> float:
+    def _descriptor_log_ratio(self) -> float:
         """log p(phi), nats, relative to the other known areas."""
-        areas = [self._area, *(area for area in self._asked.known_areas if area != self._area)]
-        keyframes = [self._asked.hybrid_map.keyframes(area) for area in areas]
-        return float(descriptor_log_ratio(self._asked.looks.similarity(self.fresh, keyframes)[0]))
+        areas = [self._area, *(area for area in self._examination.known_areas if area != self._area)]
+        keyframes = [self._examination.hybrid_map.keyframes(area) for area in areas]
+        return float(descriptor_log_ratio(self._examination.descriptors.similarity(self.unmatched, keyframes)[0]))
 
 
 def _match(points: NDArray[np.float64], pose: Pose, grid: AreaGrid) -> Match:
-    """How samples that stand at ``grid_T_points`` lie in a grid."""
+    """The match of samples at ``grid_T_points`` with a grid."""
     found = grid.compare(points, pose)
     score = log_ratio_at(LogRatioGrid(grid.fine_log_ratio, grid.origin, 0.5 * grid.cell), points, pose)
     return Match(found.samples, score, found.on_surface, found.in_free_space)

@@ -1,13 +1,13 @@
-"""Loops that a drive offers to close, by the truth alone, and when the map closed each.
+"""True loops of a drive, and the time at which the map closed each.
 
-The robot *enters again* where, after some metres on ground that it had not driven on, it comes to the place of a
-keyframe of long before. Such a loop can be closed where the robot stays on known ground for some metres, sees there
-what it saw before, and where the definite map did not know yet that the two places meet. It is closed when the definite
-map has a keyframe from there on in the same area as one of the old ones of its place, or in an area beside it.
+A re-entry is the arrival of the robot, after meters of new ground, at the place of an old keyframe. Such a loop can
+be closed if the robot stays on known ground for some meters, with a shared view, and the definite map had not joined
+the two places. It is closed when a keyframe of the definite map from there on is in the same area as an old one of its
+place, or in an adjacent area.
 
-A place that is entered again may look like others. Two things tell them apart: odometry, and a view that differs.
-What odometry says follows from the simulated readings under their true covariance. What views say follows from a laser
-without noise, at the true pose and at its image in the other place.
+A re-entered place may look like others. Odometry or a different view can separate them. The probability by odometry
+follows from the simulated readings under their true covariance. Views are those of a laser without noise, at the true
+pose and at its image in the other place.
 """
 
 from __future__ import annotations
@@ -27,39 +27,39 @@ from hmt_slam_ros.simulation import SimulatedLog
 from hmt_slam_ros.simulation.sight import same_place
 
 OLD = 10.0
-"""Path between two keyframes from which on the second enters again, m."""
+"""Smallest path between two keyframes of a loop, m."""
 
 AWAY, STAY = 5.0, 5.0
-"""Path on new ground before, and on known ground after, a place is entered again, m."""
+"""Path on new ground before, and on known ground after, a re-entry, m."""
 
 VIEW = 0.5
-"""Share of what a keyframe sees that was seen before where the scans can show that it is the same place."""
+"""Smallest share of a keyframe's view that an old keyframe has too, for scans that can show the loop."""
 
 GRACE = 10.0
 """Path beyond the known ground within which a loop still counts as closed in time, m."""
 
-_LOOKED_AT = 10.0  # m of the known ground, on half of whose keyframes the view must be shared
+_VIEW_STRETCH = 10.0  # m of known ground, on which half of the keyframes must have a shared view
 _PARTNERS = 3
 
 ALIKE_VIEW, ALIKE_BEAMS = 0.1, 0.05
-"""Two views differ where more than this share of the beams differ by more than so many m."""
+"""Largest difference of beams, m, and largest share of beams beyond that, of views that look the same."""
 
 ALIKE_RADIUS = 2.0
-"""The image of a pose is in a known place within this distance of an old keyframe, and in its sight, m."""
+"""Largest distance of the image of a pose from an old keyframe of its place, m."""
 
 
 @dataclass
 class Loop:
-    """A place that was entered again.
+    """A re-entry into a known place.
 
     :ivar event: the first keyframe event there.
     :ivar begin: path length since the start at that event, m; ``end``, at the last on known ground.
     :ivar length: path since the robot was there before, m.
     :ivar partners: {keyframe event: old keyframes of its place, the nearest first}.
-    :ivar linked: whether the map had joined the two places already.
+    :ivar linked: whether the map had joined the two places before.
     :ivar closed_at: path length at which the definite map joined them, m; None before.
     :ivar closed_by_event: the keyframe event of that.
-    :ivar view: share of the first keyframes there that see what was seen before.
+    :ivar view: share of the first keyframes there with a shared view.
     """
 
     event: int
@@ -74,71 +74,71 @@ class Loop:
 
     @property
     def can_be_closed(self) -> bool:
-        """Whether there was something to close and the scans could show it."""
+        """Whether the places were not joined, and scans can show that they are the same."""
         return not self.linked and self.end - self.begin >= STAY and self.view >= 0.5
 
     @property
     def in_time(self) -> bool:
-        """Whether it was closed before the robot was off again."""
+        """Whether it was closed before the end of the known ground."""
         return self.closed_at is not None and self.closed_at <= self.end + GRACE
 
 
 class Loops:
-    """Finds loops while the robot drives.
+    """Finds the loops of a drive.
 
     :ivar found: in the order of time.
     """
 
     def __init__(self, truth: Truth) -> None:
         self._truth = truth
-        self._travelled: dict[int, float] = {}
+        self._traveled: dict[int, float] = {}
         self.found: list[Loop] = []
         self._new_ground = 0.0
         self._before = 0.0
 
-    def note(self, event: int, travelled: float, known: HybridMap, area: int) -> None:
-        """Learn of a keyframe event.
+    def add_event(self, event: int, traveled: float, known: HybridMap, area: int) -> None:
+        """Add a keyframe event.
 
         :param known: the map of the most probable hypothesis before it.
         :param area: the robot's area there.
         """
-        old = [k for k, at in self._travelled.items() if at <= travelled - OLD]
+        old = [k for k, at in self._traveled.items() if at <= traveled - OLD]
         partners = self._partners(event, old)
-        self._travelled[event] = travelled
-        step, self._before = travelled - self._before, travelled
+        self._traveled[event] = traveled
+        step, self._before = traveled - self._before, traveled
         if not partners:
             self._new_ground += step
             return
         if not self.found or self._new_ground >= AWAY:
-            length = travelled - max(self._travelled[k] for k in partners)
-            linked = _linked(known, _areas(known), area, partners)
-            self.found.append(Loop(event, travelled, travelled, length, linked=linked))
+            length = traveled - max(self._traveled[k] for k in partners)
+            linked = _is_linked(known, _area_of_keyframes(known), area, partners)
+            self.found.append(Loop(event, traveled, traveled, length, linked=linked))
         self._new_ground = 0.0
         self.found[-1].partners[event] = partners
-        self.found[-1].end = travelled
+        self.found[-1].end = traveled
 
-    def definite(self, event: int, known: HybridMap, area: int) -> None:
-        """Learn of the definite map at a keyframe event, and of the robot's area in it."""
+    def update_definite(self, event: int, known: HybridMap, area: int) -> None:
+        """Update the loops by the definite map after a keyframe event, and the robot's area in it."""
         unclosed = [loop for loop in self.found if loop.closed_at is None]
-        areas = _areas(known) if unclosed else {}
+        areas = _area_of_keyframes(known) if unclosed else {}
         for loop in unclosed:
-            where = {k: areas[k] for k in loop.partners if k in areas}
+            area_of_event = {k: areas[k] for k in loop.partners if k in areas}
             if event in loop.partners:
-                # Keyframes that tell nothing new are in no area.
-                where[event] = area
-            if any(_linked(known, areas, own, loop.partners[k]) for k, own in where.items()):
-                loop.closed_at, loop.closed_by_event = self._travelled[event], event
+                # Redundant keyframes are in no area.
+                area_of_event[event] = area
+            if any(_is_linked(known, areas, area_then, loop.partners[k]) for k, area_then in area_of_event.items()):
+                loop.closed_at, loop.closed_by_event = self._traveled[event], event
 
     def finish(self) -> None:
-        """Work out what of each loop could be seen."""
+        """Compute the shared view of each loop."""
         for loop in self.found:
             if not loop.linked and loop.end - loop.begin >= STAY:
-                first = [k for k in loop.partners if self._travelled[k] <= loop.begin + _LOOKED_AT]
-                seen = [self._truth.shared_view(k, loop.partners[k]).max() >= VIEW for k in first]
-                loop.view = float(np.mean(seen))
+                first = [k for k in loop.partners if self._traveled[k] <= loop.begin + _VIEW_STRETCH]
+                is_shared = [self._truth.shared_view(k, loop.partners[k]).max() >= VIEW for k in first]
+                loop.view = float(np.mean(is_shared))
 
     def _partners(self, event: int, old: list[int]) -> tuple[int, ...]:
-        """The old keyframes in whose place the robot is, the nearest of them."""
+        """The nearest old keyframes in whose place the robot is."""
         if not old:
             return ()
         inside = self._truth.same_place([event], old)[0]
@@ -147,26 +147,26 @@ class Loops:
         return tuple(sorted(near, key=lambda k: float(np.hypot(*(self._truth.poses[k] - here)[:2])))[:_PARTNERS])
 
 
-def _areas(hybrid_map: HybridMap) -> dict[int, int]:
+def _area_of_keyframes(hybrid_map: HybridMap) -> dict[int, int]:
     """{keyframe: its area}."""
     return {k: area for area in hybrid_map.area_ids() for k in hybrid_map.keyframes(area)}
 
 
-def _linked(hybrid_map: HybridMap, areas: Mapping[int, int], area: int, keyframes: tuple[int, ...]) -> bool:
-    """Whether one of the keyframes is in an area or in one beside it."""
+def _is_linked(hybrid_map: HybridMap, areas: Mapping[int, int], area: int, keyframes: tuple[int, ...]) -> bool:
+    """Whether one of the keyframes is in an area or in an adjacent one."""
     near = {area, *hybrid_map.neighbors(area)}
     return any(areas.get(keyframe) in near for keyframe in keyframes)
 
 
 @dataclass(frozen=True)
 class Rivalry:
-    """A known place that the robot enters again, and others that it knows and that look the same.
+    """A re-entry into a known place that looks the same as other known places.
 
     :ivar event: the first keyframe event there.
-    :ivar since: the last keyframe event at which the robot knew where it was: the last before it saw nothing, or where
-        it always saw something, when it was there last.
+    :ivar since: the last keyframe event with a certain pose: the last before the robot saw nothing, or if it always saw
+        something, the last one in this place.
     :ivar by_odometry: probability of the true place among all that look the same, by odometry alone since then.
-    :ivar evidence: the first keyframe event at which the view is not the same in all of them; None where that is never.
+    :ivar evidence: the first keyframe event at which the views differ; None if there is none.
     """
 
     event: int
@@ -175,54 +175,54 @@ class Rivalry:
     evidence: int | None
 
 
-def rivalries(log: SimulatedLog, truth: Truth, loops: list[Loop], travelled: Mapping[int, float]) -> list[Rivalry]:
-    """All of a drive.
+def find_rivalries(log: SimulatedLog, truth: Truth, loops: list[Loop], traveled: Mapping[int, float]) -> list[Rivalry]:
+    """The rivalries of a drive.
 
-    :param loops: the places that the robot entered again.
-    :param travelled: {keyframe event: path length since the start, m}.
+    :param loops: of the drive.
+    :param traveled: {keyframe event: path length since the start, m}.
     """
-    moves = _moves(log.scenario.building.twin_frames)
-    found = [_rivalry(log, truth, loop, moves, travelled) for loop in loops if moves]
+    moves = _twin_motions(log.scenario.building.twin_frames)
+    found = [_find_rivalry(log, truth, loop, moves, traveled) for loop in loops if moves]
     return [rivalry for rivalry in found if rivalry is not None]
 
 
-def _rivalry(
-    log: SimulatedLog, truth: Truth, loop: Loop, moves: list[Pose], travelled: Mapping[int, float]
+def _find_rivalry(
+    log: SimulatedLog, truth: Truth, loop: Loop, moves: list[Pose], traveled: Mapping[int, float]
 ) -> Rivalry | None:
     for event, partners in loop.partners.items():
         here = truth.poses[event]
-        old = np.array([truth.poses[k] for k, at in travelled.items() if at <= travelled[event] - OLD])
-        images = [move for move in moves if _known(log, se2.compose(move, here), old)]
+        old = np.array([truth.poses[k] for k, at in traveled.items() if at <= traveled[event] - OLD])
+        images = [move for move in moves if _is_known_place(log, se2.compose(move, here), old)]
         rivals = [move for move in images if looks_alike(log, here, se2.compose(move, here))]
         if rivals:
             since = _last_certain(log, truth, event, max(partners))
             poses = [here, *(se2.compose(move, here) for move in rivals)]
-            weights = by_odometry(log, truth, since, event, poses)
+            weights = odometry_probabilities(log, truth, since, event, poses)
             later = (k for k in loop.partners if k >= event)
-            evidence = next((k for k in later if not _any_alike(log, truth.poses[k], rivals)), None)
+            evidence = next((k for k in later if not _is_any_alike(log, truth.poses[k], rivals)), None)
             return Rivalry(event, since, float(weights[0]), evidence)
     return None
 
 
-def _moves(places: Mapping[str, Pose]) -> list[Pose]:
-    """The motions of the world, ``world_T_world``, that carry one of the places into another."""
+def _twin_motions(places: Mapping[str, Pose]) -> list[Pose]:
+    """The motions of the world, ``world_T_world``, that map one of the places to another."""
     frames = list(places.values())
     pairs = [(a, b) for a in frames for b in frames if a is not b]
     moves = [se2.compose(b, se2.inverse(a)) for a, b in pairs]
     return [move for k, move in enumerate(moves) if not any(np.allclose(move, other) for other in moves[:k])]
 
 
-def _known(log: SimulatedLog, image: Pose, poses: Pose) -> bool:
+def _is_known_place(log: SimulatedLog, image: Pose, poses: Pose) -> bool:
     return bool(same_place(log.scenario.walls, image[None], poses, ALIKE_RADIUS).any())
 
 
-def _any_alike(log: SimulatedLog, pose: Pose, moves: list[Pose]) -> bool:
+def _is_any_alike(log: SimulatedLog, pose: Pose, moves: list[Pose]) -> bool:
     return any(looks_alike(log, pose, se2.compose(move, pose)) for move in moves)
 
 
 def looks_alike(log: SimulatedLog, pose: Pose, image: Pose) -> bool:
-    """Whether a laser without noise sees the same from two poses, and something at all."""
-    views = [_view(log, at) for at in (pose, image)]
+    """Whether the views of a laser without noise from two poses are the same, and not empty."""
+    views = [_noiseless_ranges(log, at) for at in (pose, image)]
     seen = [np.isfinite(view) for view in views]
     differs = seen[0] != seen[1]
     both = seen[0] & seen[1]
@@ -230,18 +230,18 @@ def looks_alike(log: SimulatedLog, pose: Pose, image: Pose) -> bool:
     return bool(seen[0].any() and np.mean(differs) <= ALIKE_BEAMS)
 
 
-def _view(log: SimulatedLog, pose: Pose) -> Pose:
+def _noiseless_ranges(log: SimulatedLog, pose: Pose) -> Pose:
     return log.scenario.laser.distances(pose[None], log.scenario.walls, np.empty((0, 3)))
 
 
 def _last_certain(log: SimulatedLog, truth: Truth, event: int, last_visit: int) -> int:
     """See :attr:`Rivalry.since`."""
-    blind = [k for k in range(last_visit, event) if not np.isfinite(_view(log, truth.poses[k])).any()]
+    blind = [k for k in range(last_visit, event) if not np.isfinite(_noiseless_ranges(log, truth.poses[k])).any()]
     return max(last_visit, blind[0] - 1) if blind else last_visit
 
 
-def by_odometry(log: SimulatedLog, truth: Truth, since: int, event: int, poses: list[Pose]) -> Pose:
-    """Probabilities, shape (n,), of some poses ``world_T_base`` at an event, all alike but for odometry.
+def odometry_probabilities(log: SimulatedLog, truth: Truth, since: int, event: int, poses: list[Pose]) -> Pose:
+    """Probabilities (n,) of some poses ``world_T_base`` at an event, by odometry alone.
 
     :param since: the event from which on there is only odometry.
     """

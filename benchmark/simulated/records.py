@@ -1,8 +1,7 @@
-"""Watched runs of simulated worlds, each in a process of its own, kept in a folder and made once.
+"""Records of runs of simulated worlds, each in its own process, kept in a folder.
 
 ``python -m benchmark.simulated.records FOLDER FILE.csv`` writes all comparisons of a folder as one table. The columns
-are those of ``benchmark.simulated.examinations.Row`` behind ``family`` and ``seed``; what could not be computed is
-empty.
+are those of ``benchmark.simulated.examinations.Row`` after ``family`` and ``seed``; missing values are empty.
 """
 
 from __future__ import annotations
@@ -31,8 +30,8 @@ _TAIL = 3  # lines of a failed run that go into a message
 
 
 @cache
-def code() -> str:
-    """What the records of this code are known by: a hash of the program and its parameters."""
+def code_hash() -> str:
+    """A hash of the program and its parameters, which identifies its records."""
     digest = hashlib.sha256(PARAMETERS.read_bytes())
     for folder in ("hmt_slam_ros", "benchmark/simulated"):
         for file in sorted((ROOT / folder).rglob("*.py")):
@@ -41,7 +40,7 @@ def code() -> str:
 
 
 def read_record(path: Path) -> Record:
-    """A record as it was written."""
+    """Read a record."""
     with gzip.open(path, "rt", encoding="utf-8") as source:
         record: Record = json.load(source)
     return record
@@ -59,16 +58,16 @@ def read_records(folder: Path) -> Iterator[Record]:
 
 
 class Records:
-    """Makes records, each once.
+    """Makes records, each at most once.
 
-    :ivar folder: where they are kept; those in it that another program or other parameters made are made anew.
+    :ivar folder: of the records; those of another program or other parameters are replaced.
     :ivar jobs: runs at the same time.
     """
 
     def __init__(self, folder: Path, jobs: int) -> None:
         self.folder, self.jobs = folder, jobs
 
-    def of(self, worlds: Iterable[World], changes: Sequence[str]) -> list[Record]:
+    def make(self, worlds: Iterable[World], changes: Sequence[str]) -> list[Record]:
         """The records of some worlds, in their order.
 
         :param changes: parameters that differ from the file, as ``name=value``.
@@ -82,7 +81,7 @@ class Records:
         path = self.folder / f"{world.name}{_SUFFIX}"
         if path.is_file():
             record = read_record(path)
-            if (record["code"], record["world"], record["changes"]) == (code(), world.log, changes):
+            if (record["code"], record["world"], record["changes"]) == (code_hash(), world.log, changes):
                 return record
         module = "benchmark.simulated.watch"
         command = [sys.executable, "-m", module, world.family, str(world.seed), str(path), *changes]
@@ -90,8 +89,8 @@ class Records:
             command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
         )
         if result.returncode:
-            last_words = " | ".join(result.stderr.strip().splitlines()[-_TAIL:]) or "nothing"
-            raise HmtSlamError(f"the run {world.name} failed, it said: {last_words}")
+            last_lines = " | ".join(result.stderr.strip().splitlines()[-_TAIL:]) or "nothing"
+            raise HmtSlamError(f"the run {world.name} failed: {last_lines}")
         record = read_record(path)
         print(f"{world.name}: {record['cpu_s']:.1f} CPU s", file=sys.stderr, flush=True)
         return record

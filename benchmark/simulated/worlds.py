@@ -1,7 +1,7 @@
-"""Which simulated worlds are mapped, and by which seeds.
+"""Simulated worlds for measurements, and their seeds.
 
 The model of the inference is fitted on training seeds alone; what docs/validation.md states was measured on validation
-seeds, which nobody looks at in order to choose anything.
+seeds, which are never used for a choice.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ SETTINGS = {
     "hall": "size=0.7,laps=2",
     "twins": "size=0.7",
 }
-"""{family: settings of its worlds}; smaller ones where that leaves what the family is for."""
+"""{family: settings of its worlds}, mostly for smaller ones."""
 
 FAMILIES = tuple(SETTINGS)
 
 LONG = "long"
-"""2 km of nested loops; it is mapped only where it is asked for by its name."""
+"""2 km of nested loops, which are mapped only if selected by name."""
 
 INSTITUTE = "institute"
-"""Hallways with open and closed doors and crossings, for what is measured there alone."""
+"""Hallways with open and closed doors and crossings, for separate measurements."""
 
 _OTHERS = {LONG: "sim:nested,seed={},size=3.3", INSTITUTE: "sim:institute,seed={}"}
 
@@ -55,7 +55,7 @@ class World:
 
     @property
     def name(self) -> str:
-        """Of its file."""
+        """Name of its file."""
         return f"{self.family}-{self.seed}"
 
 
@@ -74,4 +74,4 @@ CAMPUS = "campus"
 """The world of ``LONG`` that is compared with a metric map."""
 
 CAMPUS_WORLD = World(LONG, FIRST_VALIDATION_SEED).log
-"""2 km of way through loops of corridors, one inside the other."""
+"""A drive of 2 km through nested loops of corridors."""
