@@ -116,12 +116,12 @@ def _within_reach(landmarks: LandmarkSequence, positions: Float64, places: Place
 
 def select_landmarks(landmarks: LandmarkSequence, rows: Bool | Int64 | slice) -> LandmarkSequence:
     """The landmarks of some rows."""
-    return LandmarkSequence(*(column[rows] for column in landmarks))
+    return LandmarkSequence._make(column[rows] for column in landmarks)
 
 
 def concatenate_sequences(sequences: Sequence[LandmarkSequence]) -> LandmarkSequence:
     """Several sequences one after the other, each in its own order."""
-    return LandmarkSequence(*(np.concatenate(columns) for columns in zip(*sequences, strict=True)))
+    return LandmarkSequence._make(np.concatenate(columns) for columns in zip(*sequences, strict=True))
 
 
 def merge_sequences(sequences: Sequence[LandmarkSequence]) -> LandmarkSequence:
