@@ -272,7 +272,7 @@ def test_a_robot_that_stands_is_not_scored(drive):
         odometry=lambda reading: replace(reading, pose=np.zeros(3)),
     )
     assert subjects(log) == {}
-    assert "hardly went" in text_of(log, "translation not judged")
+    assert "hardly moved" in text_of(log, "translation not judged")
 
 
 def joint(parent, child, *, topic="/tf_static", roll=0.0, moved=0.0):

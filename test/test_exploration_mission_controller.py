@@ -202,7 +202,7 @@ def test_a_robot_that_left_a_room_looks_where_the_metric_filter_says(known_build
 
 def test_a_robot_that_is_out_of_a_room_where_it_went_in_has_got_on_and_turns_as_it_should(known_building, monkeypatch):
     # In the time and the way of a visit to the room it would not have got anywhere.
-    monkeypatch.setattr(mission_controller, "_PROGRESS", 2.0)
+    monkeypatch.setattr(mission_controller, "_MIN_PROGRESS", 2.0)
     monkeypatch.setattr(mission_controller, "_INITIAL_DISPLACEMENT", np.array((2.0, 0.0, 0.0)))
     goal = destinations(known_building)[node_at(known_building, 5.0)]
     west = state_of(node_at(known_building, 10.0), opposite_direction(eastwards(known_building)))

@@ -63,7 +63,7 @@ def test_a_sound_robot_gets_a_clean_bill(listener, doctor, start):
     assert status == 0, texts(findings, "wrong", "doubtful")
     assert texts(findings, "wrong") == []
     fine = texts(findings, "fine")
-    assert "nodes: None of the nodes of hmt_slam_ros runs, so that sensors alone were looked at." in fine
+    assert "nodes: None of the nodes of hmt_slam_ros runs, so only the sensors were checked." in fine
     assert "frames: Odometry is odom -> base_link, scans are in laser." in fine
     assert any("were compared with odometry" in text for text in fine)
 

@@ -235,5 +235,5 @@ def test_as_a_log_it_goes_on_until_its_end():
 
 @pytest.mark.parametrize("name", ["slips", "sweep", "moved", "carried"])
 def test_settings_of_scripted_drives_alone_are_refused(name):
-    with pytest.raises(HmtSlamError, match=f"knows no {name}: set {name}=0"):
+    with pytest.raises(HmtSlamError, match=f"has no setting {name}: set {name}=0"):
         robot_in(**{name: 0.1})

@@ -180,7 +180,7 @@ def mounting_findings(scans: ScanStatistics) -> Iterator[Finding]:
     distance = float(np.hypot(scans.laser_poses[:, 0], scans.laser_poses[:, 1]).max())
     if distance > _FAR_LASER:
         text = (
-            f"The laser is said to be {distance:.2f} m from the robot's middle: check the unit (m) and the direction "
+            f"The laser is stated to be {distance:.2f} m from the robot's middle: check the unit (m) and the direction "
             "of the transform base_link -> laser."
         )
         yield Finding("wrong", "laser far away", text)

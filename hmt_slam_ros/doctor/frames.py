@@ -194,8 +194,8 @@ def _check_parents(messages: MessageStatistics) -> Iterator[Finding]:
     for child, names in parents.items():
         if len(names) > 1:
             text = (
-                f"The frame {child!r} is said to be in {' and in '.join(sorted(names))}: a frame has one parent; stop "
-                "one of the publishers (robot_state_publisher, static_transform_publisher, a driver, another SLAM)."
+                f"The frame {child!r} has the parents {' and '.join(sorted(names))}: a frame has one parent; stop one "
+                "of the publishers (robot_state_publisher, static_transform_publisher, a driver, another SLAM)."
             )
             yield Finding("wrong", "two parents", text)
 

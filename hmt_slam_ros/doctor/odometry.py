@@ -352,7 +352,7 @@ def _check_mirrored(comparison: OdometryComparison) -> Iterator[Finding]:
 
 def _check_rotation(rotation: ScalarEstimate | None) -> Iterator[Finding]:
     if rotation is None:
-        text = "The robot hardly turned where scans show it, so that clock, turns and place of the laser stay open."
+        text = "The robot hardly turned where the scans show it, so clock, turns and the laser's place are unknown."
         yield Finding("fine", "rotation not judged", text)
         return
     severity = _severity(rotation.excess(_SCALE, 1.0))
@@ -367,7 +367,9 @@ def _check_rotation(rotation: ScalarEstimate | None) -> Iterator[Finding]:
 
 def _check_translation(translation: ScalarEstimate | None) -> Iterator[Finding]:
     if translation is None:
-        text = "The robot hardly went where scans show how far, so that ways and the laser's yaw could not be judged."
+        text = (
+            "The robot hardly moved where the scans show it, so translations and the laser's yaw could not be judged."
+        )
         yield Finding("fine", "translation not judged", text)
         return
     severity = _severity(translation.excess(_SCALE, 1.0))
@@ -441,7 +443,7 @@ def _check_slip(comparison: OdometryComparison) -> Iterator[Finding]:
 
 def _summary(comparison: OdometryComparison) -> Finding:
     parts = [f"{comparison.motion_count} motions from scan to scan were compared with odometry"]
-    for estimate, name in ((comparison.rotation_scale, "turns"), (comparison.translation_scale, "ways")):
+    for estimate, name in ((comparison.rotation_scale, "turns"), (comparison.translation_scale, "translations")):
         if estimate is not None:
             parts.append(f"its {name} are {_factor_text(estimate)} times the scans'")
     if comparison.laser_yaw is not None:

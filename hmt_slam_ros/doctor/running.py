@@ -112,7 +112,7 @@ def _check_nodes(running: RunningSystem, *, all_active: bool) -> Iterator[Findin
     present = [name for name in OUR_NODES if name in running.nodes]
     missing = [name for name in OUR_NODES if name not in present]
     if not present:
-        text = "None of the nodes of hmt_slam_ros runs, so that sensors alone were looked at."
+        text = "None of the nodes of hmt_slam_ros runs, so only the sensors were checked."
         yield Finding("fine", "nodes", text)
     elif missing:
         verb = "is" if len(missing) == 1 else "are"
@@ -161,8 +161,8 @@ def _check_silence(running: RunningSystem, *, all_active: bool) -> Iterator[Find
         and all_active
     ):
         text = (
-            f"Scans come, and slam said nothing about one for {running.seconds:g} s: it is paused, or "
-            "waits for odometry, a transform or the other nodes; its own log and /diagnostics say for which."
+            f"Scans arrive, but slam sent no estimate for {running.seconds:g} s: it is paused, or waits for odometry, "
+            "a transform or the other nodes; its own log and /diagnostics say for which."
         )
         yield Finding("doubtful", "slam silent", text)
 
@@ -200,7 +200,7 @@ def _check_publishers(running: RunningSystem) -> Iterator[Finding]:
             yield Finding("wrong", "two publishers", text)
     for transform, count in running.conflicting_transforms.items():
         text = (
-            f"The transform {transform} was told differently for one stamp {times_text(count)}: two nodes publish it, "
+            f"The transform {transform} had different values at one stamp {times_text(count)}: two nodes publish it, "
             f"of {_join_names(running.topics[TF].publishers)}; stop one of them (or its publish_tf)."
         )
         yield Finding("wrong", "two transforms", text)

@@ -121,7 +121,7 @@ def select_landmarks(landmarks: LandmarkSequence, rows: Bool | Int64 | slice) ->
 
 def concatenate_sequences(sequences: Sequence[LandmarkSequence]) -> LandmarkSequence:
     """Several sequences one after the other, each in its own order."""
-    return LandmarkSequence(*(np.concatenate(columns) for columns in zip(*sequences, strict=True)))
+    return LandmarkSequence._make(np.concatenate(columns) for columns in zip(*sequences, strict=True))
 
 
 def merge_sequences(sequences: Sequence[LandmarkSequence]) -> LandmarkSequence:

@@ -54,7 +54,7 @@ _REFERENCE_PLACEMENTS = 24
 """Keyframes of the map at which the likelihood of unmapped ground is measured."""
 
 _FAMILIARITY = 0.9
-"""Probability that unmapped ground looks like one of these (docs/reports/2026-11-24-prior.md)."""
+"""Probability that unmapped ground looks like one of these; docs/reports/2026-11-24-prior.md has the alternatives."""
 
 
 class ReferencePlacement(NamedTuple):
