@@ -58,7 +58,7 @@ def area_abstraction(configuration: Configuration, state: AamState | None = None
 
 
 def _opening_detector(configuration: Configuration) -> OpeningDetector | None:
-    if configuration.aam.area_policy == "ncut":
+    if configuration.aam.area_policy != "both":
         return None
     from hmt_slam_ros.landmarks.area_landmarks import LandmarkOpeningDetector  # noqa: PLC0415
 

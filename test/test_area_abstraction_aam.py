@@ -150,22 +150,22 @@ def pair_counts(monkeypatch):
     return counts
 
 
-def test_a_new_keyframe_is_compared_with_each_of_its_area_once(measured):
+def test_a_new_keyframe_is_compared_with_each_of_its_area_once(pair_counts):
     process = aam(ncut_threshold=0.0)
     for k, pose in enumerate(THERE[:12]):
-        measured.clear()
+        pair_counts.clear()
         process.handle(keyframe(k, pose, estimate(0, 0, pose)))
         # Once with all for the graph and once with the eight nearest for the question whether the robot moved.
-        assert sum(measured) == k + min(k, 8)
+        assert sum(pair_counts) == k + min(k, 8)
         process.handle(stay(k, 0))
 
 
-def test_nothing_is_measured_again_when_hypotheses_branch_into_a_new_area(measured):
+def test_nothing_is_measured_again_when_hypotheses_branch_into_a_new_area(pair_counts):
     process = aam()
     event, k = drive_until_cut(process)
-    measured.clear()
+    pair_counts.clear()
     process.handle(Hypotheses(k, (area_change(1, event, k, 1, 0, 0.6), area_change(2, event, k, 2, 0, 0.4))))
-    assert sum(measured) == 0
+    assert sum(pair_counts) == 0
 
 
 def answered_in_first_room(process):
@@ -235,17 +235,17 @@ def test_new_keyframes_stay_at_a_move_and_become_old_ground():
         process.handle(stay(step, 0, area=0))
 
 
-def test_a_closure_puts_the_keyframes_beside_the_known_ones_and_compares_only_across(measured):
+def test_a_closure_puts_the_keyframes_beside_the_known_ones_and_compares_only_across(pair_counts):
     process = aam()
     event, k = drive_until_cut(process)
     # Played: the second room is taken for a known area, which here is area 0 itself under another name.
     process.handle(Hypotheses(k, (area_change(7, event, k, 1, 0, 0.5), area_change(8, event, k, 2, 0, 0.5))))
-    measured.clear()
+    pair_counts.clear()
     back = {i: se2.between(THERE[0], THERE[i]) for i in event.keyframes}
     relabelled = tuple(MovedKeyframe(i, 7, 0, pose) for i, pose in back.items())
     process.handle(Hypotheses(k + 1, (Hypothesis(1, 1, 1.0, 0, exact(np.zeros(3)), relabelled),)))
     known = k + 1 - len(event.keyframes)
-    assert sum(measured) == known * len(event.keyframes)
+    assert sum(pair_counts) == known * len(event.keyframes)
 
 
 def test_a_hypothesis_that_does_not_store_the_keyframe_is_not_cut():
@@ -350,7 +350,7 @@ def test_a_merge_is_evaluated_again_on_leaving_and_with_one_hypothesis_only():
     assert (event.kind, event.area, event.into) == ("merged", 2, 0)
 
 
-def test_two_areas_are_measured_again_only_where_the_arc_between_them_moved(measured):
+def test_two_areas_are_measured_again_only_where_the_arc_between_them_moved(pair_counts):
     process = aam()
     answer, k = close_loop(process, AGAIN)
     pose, before = se2.between(AGAIN[0], AGAIN[-1]), answer.events[0].score
@@ -358,7 +358,7 @@ def test_two_areas_are_measured_again_only_where_the_arc_between_them_moved(meas
         two_T_zero = se2.compose(se2.between(AGAIN[0], THERE[0]), (error, 0.0, 0.0))
         process.handle(stay(later, 0, area=2))
         process.handle(ClosureDecision(later, 0, (Arc(2, 0, exact(two_T_zero), closure=True),)))
-        measured.clear()
+        pair_counts.clear()
         (answer,) = process.handle(keyframe(later + 1, AGAIN[-1], estimate(0, 2, pose, stored=False)))
         moved = error == 0.1
-        assert (answer.events[0].score != before) == bool(measured) == moved
+        assert (answer.events[0].score != before) == bool(pair_counts) == moved

@@ -14,7 +14,7 @@ from hmt_slam_ros.sensors import Scan
 LAPS = 6
 
 
-class Ears:
+class Observer:
     """Two recorders, of which one keeps all messages; what was forgotten, and when."""
 
     def __init__(self, *recorders):
@@ -35,8 +35,8 @@ class Rounds:
     def __init__(self):
         self.log = open_log(f"sim:office,size=0.7,rate=2.5,laps={LAPS}")
         self.run, self.folding = LockStepRun(Configuration()), Recorder(Configuration())
-        self.ears = Ears(self.run.recorder, self.folding)
-        self.run.lock_step.processes["recorder"] = self.ears
+        self.observer = Observer(self.run.recorder, self.folding)
+        self.run.lock_step.processes["recorder"] = self.observer
         self.keyframes, self.kept = [], 0
         for record in self.log.records():
             self.run.process_record(record)
@@ -45,7 +45,7 @@ class Rounds:
             if isinstance(record.measurement, Scan) and self.run.scans_read * LAPS >= self.log.scan_count * (
                 len(self.keyframes) + 1
             ):
-                self.keyframes.append(len(self.placed))
+                self.keyframes.append(len(self.area_of_keyframe))
         self.result = self.run.finish()
         self.log_state = self.result.log_progress
         self.recording = self.run.recorder.finish(self.log_state.stamps)
@@ -70,7 +70,7 @@ def test_the_map_of_later_laps_is_no_larger(rounds):
 
 
 def test_pruned_keyframes_were_stored_and_are_gone_in_every_process(rounds):
-    state, gone = rounds.run.state, {one.keyframe for one in rounds.ears.forgotten}
+    state, gone = rounds.run.state, {one.keyframe for one in rounds.observer.forgotten}
     assert len(gone) >= 4 * (LAPS - 2)
     for replica in (
         state.processes["slam"].replica,
@@ -81,7 +81,7 @@ def test_pruned_keyframes_were_stored_and_are_gone_in_every_process(rounds):
     ):
         assert not gone & replica.scans.keys()
         assert replica.scans.keys() == state.processes["slam"].replica.scans.keys()
-    assert not gone & rounds.placed
+    assert not gone & rounds.area_of_keyframe
     for live in state.processes["slam"].live_hypotheses.values():
         assert not gone & {
             *live.particle_filter.keyframes,
@@ -94,7 +94,7 @@ def test_pruned_keyframes_were_stored_and_are_gone_in_every_process(rounds):
 
 def test_every_scan_keeps_its_pose_relative_to_a_keyframe_that_is_there(rounds):
     scans = rounds.recording.relative_trajectory
-    assert set(scans.keyframes.tolist()) <= rounds.placed
+    assert set(scans.keyframes.tolist()) <= rounds.area_of_keyframe
     known = scans.keyframes >= 0
     assert known.all()
     assert np.hypot(*scans.poses[:, :2].T).max() < 3.0

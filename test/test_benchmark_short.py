@@ -83,7 +83,7 @@ def test_a_regression_of_the_bundled_log_fails_the_command(tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["short", "--write-expected"], "not all that is expected can be measured"),
+        (["short", "--write-expected"], "not all expected figures can be measured"),
         (["accuracy", "--logs", "mars"], "there is no log 'mars'"),
         (["accuracy", "--write-docs", "--logs", "malaga"], "leave --set and --logs away"),
         (["accuracy", "--logs", "malaga", "--seeds", "1", "--set", "no.such=1"], "the run malaga-no.such_1-0 failed"),

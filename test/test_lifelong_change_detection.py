@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from benchmark.one_drive import OneDrive
+from benchmark.one_drive import JoinedVisits
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.lifelong.change_detection import RecentScan, append_recent_scan, combine_stale_beams, detect_changes
 from hmt_slam_ros.messages.documents import KeyframeHeader, encode
@@ -172,7 +172,7 @@ def read(run, records):
 @pytest.fixture(scope="module")
 def visits(tmp_path_factory):
     """The state after a visit; of a second one the keyframes, what was read of it, in two parts, and the states."""
-    log = OneDrive([open_simulated(WORLD.format(number)) for number in (1, 2)])
+    log = JoinedVisits([open_simulated(WORLD.format(number)) for number in (1, 2)])
     records, first = list(log.records()), log.scan_count // 2
     scans = np.cumsum([isinstance(record.measurement, Scan) for record in records])
     ends = [int(np.searchsorted(scans, count, side="right")) for count in (first, first + MIDDLE, first + END)]

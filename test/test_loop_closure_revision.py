@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from misled import misled, run
+from misled import make_misled, run
 from ring_for_tsbi import RING, Run, ring_drive
 
 from hmt_slam_ros.configuration import Configuration
@@ -314,7 +314,7 @@ def drives():
 
     By itself the false closure is within what is admitted of a cycle.
     """
-    return run(open_log(LOG), Configuration()), run(open_log(LOG), Configuration(), misled(2, 0, 3.8))
+    return run(open_log(LOG), Configuration()), run(open_log(LOG), Configuration(), make_misled(2, 0, 3.8))
 
 
 def arcs(recording):

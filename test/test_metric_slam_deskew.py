@@ -76,9 +76,9 @@ def drive_sweeping(sweep, timed):
         while odometry and odometry[0].stamp < stamp + PERIOD * SECOND:
             dialogue.send(odometry.pop(0))
     dialogue.send(EndOfLog())
-    assert not dialogue.of(Notice)
-    estimates = np.array([estimate.pose.mean for estimate in dialogue.of(LocalEstimate)])
-    stored = [(k.scan, k.estimates[0].pose.mean) for k in dialogue.of(Keyframe) if k.estimates[0].stored]
+    assert not dialogue.messages_of(Notice)
+    estimates = np.array([estimate.pose.mean for estimate in dialogue.messages_of(LocalEstimate)])
+    stored = [(k.scan, k.estimates[0].pose.mean) for k in dialogue.messages_of(Keyframe) if k.estimates[0].stored]
     image = occupancy_image([scan for scan, _ in stored], np.array([pose for _, pose in stored]), 0.05, 30.0)
     errors = se2.between(true_pose(np.arange(SCANS) * PERIOD), estimates)
     return Drive(errors, int(np.sum(image.pixels == OCCUPIED)))
@@ -117,7 +117,7 @@ def test_a_scan_waits_until_odometry_covers_its_last_beam():
     dialogue.send(Odometry(SECOND + SECOND * 8 // 100, np.array([0.08, 0.0, 0.0])))
     assert not dialogue.answers
     dialogue.send(Odometry(SECOND + SECOND * 9 // 100, np.array([0.09, 0.0, 0.0])))
-    (keyframe,) = dialogue.of(Keyframe)
+    (keyframe,) = dialogue.messages_of(Keyframe)
     np.testing.assert_allclose(keyframe.scan.motion, (0.09, 0.0, 0.0), atol=1e-9)
 
 
@@ -126,7 +126,7 @@ def test_at_the_end_of_a_log_the_last_sweep_goes_on_as_the_odometry_did():
     dialogue.send(Odometry(SECOND, np.zeros(3)), sweeping_scan(0))
     assert not dialogue.answers
     dialogue.send(EndOfLog())
-    np.testing.assert_allclose(dialogue.of(Keyframe)[0].scan.motion, (0.09, 0.0, 0.0), atol=1e-9)
+    np.testing.assert_allclose(dialogue.messages_of(Keyframe)[0].scan.motion, (0.09, 0.0, 0.0), atol=1e-9)
 
 
 def test_an_impossible_time_increment_is_reported_once_and_no_scan_is_lost():
@@ -134,7 +134,7 @@ def test_an_impossible_time_increment_is_reported_once_and_no_scan_is_lost():
     for k in range(10):
         stamp = SECOND + k * SECOND // 10
         dialogue.send(Odometry(stamp, np.zeros(3)), replace(sweeping_scan(k), time_increment=np.nan))
-    assert len(dialogue.of(LocalEstimate)) == 10
-    (notice,) = dialogue.of(Notice)
+    assert len(dialogue.messages_of(LocalEstimate)) == 10
+    (notice,) = dialogue.messages_of(Notice)
     assert "time_increment = nan s" in notice.text
-    assert all(keyframe.scan.time_increment == 0.0 for keyframe in dialogue.of(Keyframe))
+    assert all(keyframe.scan.time_increment == 0.0 for keyframe in dialogue.messages_of(Keyframe))

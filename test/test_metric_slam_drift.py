@@ -56,8 +56,8 @@ def drives():
     return drive_.drive_along(THERE[1:]), drive_.drive_along(AGAIN)
 
 
-def test_over_ground_that_is_mapped_a_bare_corridor_bounds_the_drift_across_alone(driven):
-    there, again = driven
+def test_over_ground_that_is_mapped_a_bare_corridor_bounds_the_drift_across_alone(drives):
+    there, again = drives
     assert all(estimate.stored for estimate in there)
     assert not any(estimate.stored for estimate in again)
     first, last = deviations(there[-1]), deviations(again[-1])
@@ -66,8 +66,8 @@ def test_over_ground_that_is_mapped_a_bare_corridor_bounds_the_drift_across_alon
     assert last[1] < 0.5 * 0.05 * np.sqrt(31)
 
 
-def test_where_the_map_is_as_far_off_as_its_keyframes_so_is_a_pose_in_it(driven):
-    there, again = driven
+def test_where_the_map_is_as_far_off_as_its_keyframes_so_is_a_pose_in_it(drives):
+    there, again = drives
     near, far = deviations(again[1]), deviations(again[-1])
     assert near[2] < far[2]
     assert far[2] == pytest.approx(deviations(there[-1])[2], rel=0.5)

@@ -29,7 +29,7 @@ def turning_drive(rate, seconds=24.0):
 
 def errors(dialogue, truths):
     """Largest distance, m, and angle, degrees, of any estimate from the truth."""
-    poses = np.array([estimate.pose.mean for estimate in dialogue.of(LocalEstimate)])
+    poses = np.array([estimate.pose.mean for estimate in dialogue.messages_of(LocalEstimate)])
     difference = se2.between(np.array(truths), poses)
     return np.hypot(*difference[:, :2].T).max(), np.degrees(np.abs(difference[:, 2])).max()
 
@@ -49,7 +49,7 @@ def test_a_slip_in_a_turn_does_not_lose_the_robot_and_is_reported_once(rate, sli
     distance, angle = errors(dialogue, truths)
     assert distance < 0.08
     assert angle < 1.5
-    (notice,) = (notice for notice in dialogue.of(Notice) if "the scans are believed" in notice.text)
+    (notice,) = (notice for notice in dialogue.messages_of(Notice) if "the scans are believed" in notice.text)
     by_odometry, by_scans = map(float, re.findall(r"turned by (-?\d+) degrees", notice.text))
     assert by_odometry - by_scans == pytest.approx(slip, abs=6.0)
     begin, end = map(float, re.search(r"from ([\d.]+) s to ([\d.]+) s", notice.text).groups())
@@ -63,11 +63,11 @@ def test_without_odometry_the_robot_is_tracked_from_its_first_scan_on(rate):
         dialogue.send(scan)
         truths.append(pose)
     dialogue.send(EndOfLog())
-    assert len(dialogue.of(LocalEstimate)) == len(truths)
+    assert len(dialogue.messages_of(LocalEstimate)) == len(truths)
     distance, angle = errors(dialogue, truths)
     assert distance < 0.08
     assert angle < 1.5
-    (notice,) = dialogue.of(Notice)
+    (notice,) = dialogue.messages_of(Notice)
     assert "wait for odometry" in notice.text
 
 
@@ -89,7 +89,7 @@ def test_odometry_that_falls_silent_and_comes_back_is_used_again():
     distance, angle = errors(dialogue, truths)
     assert distance < 0.08
     assert angle < 1.5
-    assert len(dialogue.of(LocalEstimate)) == len(truths)
+    assert len(dialogue.messages_of(LocalEstimate)) == len(truths)
 
 
 def test_readings_that_are_missing_here_and_there_are_bridged():
@@ -102,7 +102,7 @@ def test_readings_that_are_missing_here_and_there_are_bridged():
     distance, angle = errors(dialogue, truths)
     assert distance < 0.08
     assert angle < 1.5
-    assert not dialogue.of(Notice)
+    assert not dialogue.messages_of(Notice)
 
 
 def test_noise_beyond_the_model_is_learnt_and_reported_once():
@@ -119,7 +119,7 @@ def test_noise_beyond_the_model_is_learnt_and_reported_once():
     distance, angle = errors(dialogue, truths)
     assert distance < 0.1
     assert angle < 2.0
-    assert len([notice for notice in dialogue.of(Notice) if "noise model" in notice.text]) == 1
+    assert len([notice for notice in dialogue.messages_of(Notice) if "noise model" in notice.text]) == 1
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from make_misled import make_misled
+from misled import make_misled
 
 from hmt_slam_ros.cli import run_commands
 from hmt_slam_ros.cli.arguments import build_parser

@@ -122,8 +122,8 @@ def test_a_node_of_it_answers_and_saves_its_part(with_row, listener, start, tmp_
     from hmt_slam_ros.messages.messages import ClosureDecision, Notice  # noqa: PLC0415
     from hmt_slam_ros.ros import topics  # noqa: PLC0415
 
-    notices = listener.hear(String, topic_of("Notice"), topics.CHAIN)
-    answers = listener.hear(String, topic_of("SaveResponse"), topics.CHAIN)
+    notices = listener.subscribe(String, topic_of("Notice"), topics.CHAIN)
+    answers = listener.subscribe(String, topic_of("SaveResponse"), topics.CHAIN)
     decisions = listener.node.create_publisher(String, topic_of("ClosureDecision"), topics.CHAIN)
     requests = listener.node.create_publisher(String, topic_of("SaveRequest"), topics.CHAIN)
     start(NAME)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numba import njit
-from test_registration_scan_to_map import ALIGNMENT, MODEL, ROOM, mapped, seen
+from test_registration_scan_to_map import ALIGNMENT, MODEL, ROOM, make_map, scan_surfels
 
 from benchmark.allocations import ARRAYS, count_allocations, requirements_on
 from hmt_slam_ros.configuration import Configuration
@@ -36,8 +36,8 @@ def test_mapping_takes_no_memory_but_for_the_arrays_that_kernels_are_expected_to
 @pytest.mark.parametrize("particles", [1, 60])
 @pytest.mark.parametrize("beams", [11, 361])
 def test_proposals_take_their_results_alone_for_any_number_of_particles_and_beams(particles, beams):
-    pool, table = mapped(ROOM, [(0, 0, 0)])
-    points, poses = seen(ROOM, (0.1, 0, 0), beams=beams), np.zeros((particles, 3))
+    pool, table = make_map(ROOM, [(0, 0, 0)])
+    points, poses = scan_surfels(ROOM, (0.1, 0, 0), beams=beams), np.zeros((particles, 3))
     arguments = (
         points,
         points,

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from test_results_output_folder import EVERY, SCANS, STAMPS, TRUTH, recorded, scan
+from test_results_output_folder import EVERY, SCANS, STAMPS, TRUTH, make_recorder, scan
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.results.final_map import final_map
@@ -22,7 +22,7 @@ def blind(seen: Scan) -> Scan:
 
 
 def test_where_no_scans_overlap_the_motion_that_metric_slam_found_stands() -> None:
-    recorder = recorded()
+    recorder = make_recorder()
     recording = with_wrong_odometry(recorder.finish(STAMPS))
     replica = replace(recording.replica, scans={k: blind(seen) for k, seen in recording.replica.scans.items()})
     scans = [blind(scan(index)) for index in range(SCANS)]

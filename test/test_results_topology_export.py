@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import networkx as nx
 import numpy as np
 import pytest
-from test_results_output_folder import COVARIANCE, MAP_T_AREA_1, recorded, write
+from test_results_output_folder import COVARIANCE, MAP_T_AREA_1, make_recorder, write
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -28,7 +28,7 @@ NUMBERS = ("x", "y", "theta", "xx", "xy", "xt", "yy", "yt", "tt")
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("exported")
-    write(directory, recorded())
+    write(directory, make_recorder())
     return directory
 
 

@@ -1,12 +1,12 @@
-"""A robot that starts anywhere in a map, or is kidnapped, maps around itself until it is relocalized."""
+"""A robot that starts somewhere in a map, or is kidnapped, maps around itself, until it is recognized where it is."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from benchmark.awakening import FAR, awakened, mapped
-from benchmark.kidnapping import SOON, kidnapped
+from benchmark.awakening import FAR, map_log, try_start
+from benchmark.kidnapping import SOON, drive_kidnapped
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -27,7 +27,7 @@ OFF = np.array([5.0, 0.0, 0.0])
 
 @pytest.fixture(scope="module")
 def maps():
-    return mapped(WORLD, Configuration())
+    return map_log(WORLD, Configuration())
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def begin(office):
     return [scan for scan in office.scans if office.records[scan].measurement.stamp in known][60]
 
 
-def run_in_map(office, records, scans):
+def start_in_map(office, records, scans):
     """A run that started in a map and read so many scans."""
     run = LockStepRun(Configuration(), state=office.state)
     run.lock_step.feed(PoseReset())
@@ -54,9 +54,9 @@ def run_in_map(office, records, scans):
     return run
 
 
-def test_it_begins_a_new_area_with_an_uninformative_arc(office, begin):
+def test_it_begins_a_new_area_to_which_an_arc_leads_that_has_no_information(office, begin):
     before = Replica.from_state(office.state.processes["tsbi"].replica)
-    run = run_in_map(office, office.records[begin:], 10)
+    run = start_in_map(office, office.records[begin:], 10)
     replica = Replica.from_state(run.state.processes["tsbi"].replica)
     (hypothesis,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
     assert hypothesis.lost
@@ -69,9 +69,9 @@ def test_it_begins_a_new_area_with_an_uninformative_arc(office, begin):
 
 
 @pytest.mark.parametrize(("kind", "share"), [("whole", 0.15), ("whole", 0.7), ("first half", 0.5)])
-def test_it_is_relocalized_at_its_pose(maps, kind, share):
+def test_it_is_recognized_where_it_is(maps, kind, share):
     log = maps[kind]
-    found = awakened(log, log.starts[int(share * len(log.starts))])
+    found = try_start(log, log.starts[int(share * len(log.starts))])
     assert found.right
     assert not found.wrong
     assert found.found <= FAR
@@ -80,8 +80,8 @@ def test_it_is_relocalized_at_its_pose(maps, kind, share):
 @pytest.mark.parametrize("share", [0.3, 0.8])
 def test_without_landmarks_as_prior_it_is_recognized_too(maps, share):
     log = maps["first half"]
-    arguments = replace(log, configuration=with_changes(Configuration(), {"places.prior": False}))
-    found = awakened(arguments, log.starts[int(share * len(log.starts))])
+    requested = replace(log, configuration=with_changes(Configuration(), {"places.prior": False}))
+    found = try_start(requested, log.starts[int(share * len(log.starts))])
     assert found.right
     assert not found.wrong
     assert found.found <= FAR
@@ -97,35 +97,35 @@ def test_in_the_map_of_the_first_half_it_starts_in_the_second_near_keyframes_of_
     assert np.hypot(*(log.truth - whole.truth)[:, :2].T).max() < 0.5
 
 
-def test_a_single_search_does_not_relocalize_it(office, begin, monkeypatch):
-    """Every other search is 5 m off."""
-    searches, found = [], ClosureSearch.localize_globally
+def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, monkeypatch):
+    """Every other look finds it 5 m off."""
+    looks, found = [], ClosureSearch.localize_globally
 
-    def off_at_times(search, *arguments):
-        searches.append(found(search, *arguments))
-        if len(searches) % 2:
-            return searches[-1]
+    def off_at_times(search, *requested):
+        looks.append(found(search, *requested))
+        if len(looks) % 2:
+            return looks[-1]
         moved = [
             fit._replace(mode=fit.mode._replace(pose=PoseGaussian(fit.mode.pose.mean + OFF, np.eye(3))))
-            for fit in searches[-1].candidates
+            for fit in looks[-1].candidates
         ]
-        return searches[-1]._replace(candidates=tuple(moved))
+        return looks[-1]._replace(candidates=tuple(moved))
 
     monkeypatch.setattr(ClosureSearch, "localize_globally", off_at_times)
-    run = run_in_map(office, office.records[begin:], 150)
+    run = start_in_map(office, office.records[begin:], 150)
     (hypothesis,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
-    assert sum(search_result.best is not None and search_result.best[1] > 0.9 for search_result in searches) >= 3
+    assert sum(look.best is not None and look.best[1] > 0.9 for look in looks) >= 3
     assert hypothesis.lost
 
 
 @pytest.mark.parametrize("seed", [4, 5, 6, 7])
 def test_in_a_building_that_it_does_not_know_it_stays_lost(office, seed):
-    run = run_in_map(office, open_log(f"sim:grid,seed={seed},size=0.7").records(), 150)
+    run = start_in_map(office, open_log(f"sim:grid,seed={seed},size=0.7").records(), 150)
     assert all(hypothesis.lost for hypothesis in run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses)
 
 
-def test_a_standing_robot_is_relocalized_at_an_initial_pose(office, begin):
-    """At a keyframe; the initial pose is 0.4 m and 6 degrees off."""
+def test_a_robot_that_stands_still_is_localized_at_its_initial_pose(office, begin):
+    """In the place of a keyframe; the initial pose is 0.4 m and 6 degrees off."""
     replica = Replica.from_state(office.state.processes["tsbi"].replica)
     hybrid_map = replica.maps[replica.best_hypothesis]
     scan = office.records[begin].measurement
@@ -135,9 +135,9 @@ def test_a_standing_robot_is_relocalized_at_an_initial_pose(office, begin):
         for keyframe, pose in hybrid_map.keyframes(area).items()
         if replica.scans[keyframe].stamp == scan.stamp
     ]
-    hint = PoseGaussian(se2.compose(at[1], np.array([0.3, -0.25, 0.1])), np.diag([0.5, 0.5, 0.26]) ** 2)
+    messages = PoseGaussian(se2.compose(at[1], np.array([0.3, -0.25, 0.1])), np.diag([0.5, 0.5, 0.26]) ** 2)
     run = LockStepRun(Configuration(), state=office.state)
-    run.lock_step.feed(PoseReset(InitialPose(at[0], hint)))
+    run.lock_step.feed(PoseReset(InitialPose(at[0], messages)))
     for k in range(3):
         stamp = scan.stamp + k * 200_000_000
         run.lock_step.feed(Odometry(stamp, np.zeros(3)))
@@ -148,25 +148,25 @@ def test_a_standing_robot_is_relocalized_at_an_initial_pose(office, begin):
 
 
 def test_scans_are_counted_on_and_odometry_restarts(office, begin):
-    run = run_in_map(office, office.records[begin:], 25)
+    run = start_in_map(office, office.records[begin:], 25)
     assert run.state.processes["slam"].processed_scans == office.state.processes["slam"].processed_scans + 25
     assert run.state.processes["slam"].dropped_scans == 0
 
 
-def test_a_robot_kidnapped_during_mapping_is_relocalized():
-    found = kidnapped(CARRIED)
+def test_one_that_is_kidnapped_while_it_maps_notices_and_is_recognized():
+    found = drive_kidnapped(CARRIED)
     assert found.noticed <= SOON
     assert found.again <= FAR
     assert not found.confident
     assert max(found.errors) < 0.1
 
 
-def test_a_robot_kidnapped_in_localization_is_relocalized(office):
+def test_one_that_is_kidnapped_while_it_stores_nothing_notices_and_is_recognized(office):
     run = LockStepRun(Configuration(mode="localization"), state=office.state)
     run.lock_step.feed(PoseReset())
     log = open_log(CARRIED)
     jump = START + int(0.6e9 * log.scenario.drive.duration)
-    history = []
+    received = []
     for record in log.records():
         since = 1e-9 * (record.measurement.stamp - jump)
         if since > 40.0:
@@ -177,13 +177,13 @@ def test_a_robot_kidnapped_in_localization_is_relocalized(office):
             lost = all(
                 hypothesis.lost for hypothesis in run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
             )
-            history.append((since, lost))
-    assert not any(lost for since, lost in history if -1.0 < since < 0.0)
-    assert any(lost for since, lost in history if 0.0 < since < SOON)  # at 0.6 m/s at most
-    assert not history[-1][1]
+            received.append((since, lost))
+    assert not any(lost for since, lost in received if -1.0 < since < 0.0)
+    assert any(lost for since, lost in received if 0.0 < since < SOON)  # at 0.6 m/s at most
+    assert not received[-1][1]
     assert run.state.processes["slam"].dropped_scans == 0
 
 
-def test_an_uninformative_arc_differs_from_the_least_certain_one_between_areas():
+def test_an_arc_that_has_no_information_is_distinguished_from_the_least_certain_one_between_areas():
     assert is_uninformative(uninformative_belief(np.array([3.0, 4.0, 1.0])))
     assert not is_uninformative(PoseGaussian(np.zeros(3), np.diag([100.0, 100.0, 1.0]) ** 2))

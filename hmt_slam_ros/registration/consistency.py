@@ -89,7 +89,7 @@ training worlds: docs/reports/2026-11-22-evidence.md.
 SCAN_IN_STORED_MAP = ConsistencyTest(extra_rate=0.03, concentration=500.0, correlated_samples=10.0)
 """Surfaces of one scan, a sample every 0.2 m, in a stored map; half of them are in the next scan, too.
 
-As ``MAP_IN_MAP``, with twice the correlation. Its effect on relocalization: docs/validation.md.
+As ``MAP_IN_MAP``, with twice the correlation. Its effect on relocalization: docs/reports/validation.md.
 """
 
 SCAN_IN_SUBMAP = ConsistencyTest(extra_rate=0.03, concentration=500.0, correlated_samples=20.0)
@@ -108,7 +108,7 @@ WALLS_OF_MAP = ConsistencyTest(extra_rate=0.01, concentration=500.0, correlated_
 """Walls of each of two maps and scans of the other, where their surfaces fit.
 
 Most scans of a map have the same walls, and in a similar place that fits, hardly a wall is passed: 1 % in ``nested``,
-up to 6 % in ``office``, none in the right place (docs/validation.md, "Carried while it drives").
+up to 6 % in ``office``, none in the right place (docs/reports/validation.md, "Kidnapping while driving").
 """
 
 WALLS_OUTLIER_RATE = 0.001

@@ -41,7 +41,7 @@ _MIN_DISTANCE = 1e-3
 """Smallest distance between descriptors that differs from 0."""
 
 RATIO_AT_MEDIAN = -0.3
-"""log p(similarity | same place) / p(similarity | another) at the median, from `python -m benchmark appearance`.
+"""log p(similarity | same place) / p(similarity | another) at the median.
 
 From docs/reports/2026-11-22-appearance.md.
 """
