@@ -39,7 +39,7 @@ def doctor(listener):
             meanwhile()
             listener.executor.spin_once(timeout_sec=0.02)
         messages, error = process.communicate()
-        assert not error
+        assert not [line for line in error.splitlines() if "compiling kernels" not in line]  # in a new environment
         return process.returncode, json.loads(messages)["findings"]
 
     return run_doctor
@@ -140,7 +140,7 @@ def test_stamps_frames_and_doubled_transforms_are_reported_under_a_namespace(lis
         text.startswith("laser transform: No transform leads from 'base_link' to the scans' frame 'laser'")
         for text in wrong
     ), wrong
-    assert any(text.startswith("two transforms: The transform odom -> base_link was told differ") for text in wrong)
+    assert any(text.startswith("two transforms: The transform odom -> base_link had different") for text in wrong)
     doubtful = texts(findings, "doubtful")
     assert any(text.startswith("stamps against clock: The stamps of scan are 3.0") for text in doubtful), doubtful
 

@@ -319,7 +319,7 @@ def test_a_driven_robot_ends_after_its_duration_and_begins_where_the_drive_is_af
     ("parameters", "sentence"),
     [
         ({"log": "data/malaga_one_loop"}, "is no simulated world"),
-        ({"log": "sim:busy"}, "knows no moved: set moved=0"),
+        ({"log": "sim:busy"}, "has no setting moved: set moved=0"),
         ({"rate": 0.0}, "robot.drive is commands and robot.rate is 0"),
     ],
 )

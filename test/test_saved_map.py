@@ -269,13 +269,13 @@ _SAVER = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from test_saved_map import written
+from test_saved_map import write_folder
 from hmt_slam_ros.saved_map.folder import replace_folder
 
 target, turn = Path(sys.argv[1]), 0
 while True:
     turn += 1
-    replace_folder(written(target.with_name(f"next-{turn}"), version=3), target)
+    replace_folder(write_folder(target.with_name(f"next-{turn}"), version=3), target)
     print(turn, flush=True)
 """
 
