@@ -8,7 +8,7 @@ from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.loop_closure.joint_refinement import ClosureRefinement
+from hmt_slam_ros.loop_closure.closure_refinement import ClosureRefinement
 
 ROOMS = worlds.two_rooms()
 # The first room twice, and between the visits the second one, which lies beside the closure.

@@ -9,7 +9,7 @@ from worlds import box, scan_in
 from hmt_slam_ros.configuration.robot import RealTimeParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.motion_model import OdometryBuffer, deskew_scan
+from hmt_slam_ros.sensors.odometry import OdometryBuffer, deskew_scan
 from hmt_slam_ros.sensors.scan import SweepCheck
 
 ROOM = box(-3, -4, 5, 4)

@@ -6,14 +6,8 @@ import pytest
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Odometry
-from hmt_slam_ros.sensors.motion_model import (
-    Inertia,
-    MotionModel,
-    OdometryBuffer,
-    OdometryNoise,
-    RelativeMotion,
-    increment_covariance,
-)
+from hmt_slam_ros.sensors.motion_model import Inertia, MotionModel, OdometryNoise, RelativeMotion, increment_covariance
+from hmt_slam_ros.sensors.odometry import OdometryBuffer
 
 SECOND = 10**9
 SHARP = np.diag([1e4, 1e4, 1e6])

@@ -24,7 +24,7 @@ from hmt_slam_ros.hybrid_map.hybrid_map import (
 )
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.loop_closure.closure_history import Closure, MapSnapshot
-from hmt_slam_ros.loop_closure.joint_refinement import ClosureRefinement
+from hmt_slam_ros.loop_closure.closure_refinement import ClosureRefinement
 from hmt_slam_ros.messages.map_changes import Arc, MovedKeyframe
 from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.registration import scan_to_map

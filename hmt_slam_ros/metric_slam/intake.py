@@ -10,7 +10,8 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.messages import Message, Notice
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.motion_model import NO_MOTION, NOISY_FACTOR, OdometryBuffer, OdometryNoise, RelativeMotion
+from hmt_slam_ros.sensors.motion_model import NO_MOTION, NOISY_FACTOR, OdometryNoise, RelativeMotion
+from hmt_slam_ros.sensors.odometry import OdometryBuffer
 from hmt_slam_ros.sensors.scan import SweepCheck, SweepState
 from hmt_slam_ros.submap.local_filter import TrackedMotion
 

@@ -45,7 +45,8 @@ from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica,
 from hmt_slam_ros.metric_slam.intake import OdometryMonitor, OdometryMonitorState, ScanQueue, ScanQueueState
 from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis, LiveHypothesisState
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.motion_model import MotionModel, MotionState, Prediction, deskew_scan
+from hmt_slam_ros.sensors.motion_model import MotionModel, MotionState, Prediction
+from hmt_slam_ros.sensors.odometry import deskew_scan
 from hmt_slam_ros.submap.local_filter import FilterFactory, PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.particle_filter import ParticleFilters
