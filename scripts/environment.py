@@ -1,8 +1,9 @@
 """Make the virtual environment for tests and the demonstration, and keep it up to date.
 
 Where a Jazzy is sourced, its packages are used and only what it lacks is installed. Elsewhere a real rclpy comes from
-PyPI, and tf2_msgs, of which PyPI has no wheel, is compiled from scripts/tf2_msgs. Nothing but the standard library is
-needed to run this file; it prints the path of the environment's Python interpreter on standard output.
+PyPI, and tf2_msgs, of which PyPI has no wheel, is compiled from scripts/tf2_msgs; versions and hashes are those of
+requirements/*.txt. Nothing but the standard library is needed to run this file; it prints the path of the environment's
+Python interpreter on standard output.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 TF2_MSGS = ROOT / "scripts" / "tf2_msgs"
 REQUIREMENTS = ROOT / "requirements"
+FLOOR = REQUIREMENTS / "floor.txt"
 
 
 class EnvironmentSetupError(Exception):
@@ -35,12 +37,12 @@ class Environment:
 
     :ivar path: its folder.
     :ivar jazzy: whether ROS 2 Jazzy is sourced, so that rclpy and the messages are there already.
-    :ivar constraints: the pip constraints file that fixes the versions.
+    :ivar floor: whether versions are the oldest supported ones instead of the locked ones.
     """
 
     path: Path
     jazzy: bool
-    constraints: Path
+    floor: bool
     started: float = field(default_factory=time.monotonic)
 
     @property
@@ -80,9 +82,23 @@ class Environment:
             raise EnvironmentSetupError(f"{problem} ({_last_error(log)}); the whole output is in {log}")
 
     def install(self, *arguments: str | Path, problem: str) -> None:
-        """Install with pip under the environment's constraints."""
-        pip = (self.python, "-m", "pip", "install", "--disable-pip-version-check", "--no-input")
-        self.run(*pip, "--constraint", self.constraints, *arguments, problem=problem)
+        """Install with pip."""
+        self.run(
+            *(self.python, "-m", "pip", "install", "--disable-pip-version-check", "--no-input"),
+            *arguments,
+            problem=problem,
+        )
+
+    def install_requirements(self, name: str, problem: str) -> None:
+        """Install what a file of requirements/ asks for, as it is locked or within the floor.
+
+        Locked packages without a wheel are built with the locked setuptools, as pip would download another unchecked.
+        """
+        if self.floor:
+            self.install("--constraint", FLOOR, "-r", REQUIREMENTS / f"{name}.in", problem=problem)
+        else:
+            locked = REQUIREMENTS / f"{name}.txt"
+            self.install("--require-hashes", "--no-build-isolation", "-r", locked, problem=problem)
 
 
 def _last_error(log: Path) -> str:
@@ -146,7 +162,12 @@ def create(environment: Environment) -> None:
 def install_project(environment: Environment) -> None:
     """Install the project, so that its modules are used where they lie, with all that it and its tests need."""
     environment.report_progress("installing hmt_slam_ros with numpy, scipy, numba and the tools of the tests")
-    environment.install("--editable", f"{ROOT}[test]", problem="pip could not install hmt_slam_ros; is PyPI in reach?")
+    problem = "pip could not install hmt_slam_ros; is PyPI in reach?"
+    if environment.floor:
+        environment.install("--constraint", FLOOR, "--editable", f"{ROOT}[test]", problem=problem)
+    else:
+        environment.install_requirements("tested", problem)
+        environment.install("--no-deps", "--no-build-isolation", "--editable", ROOT, problem=problem)
 
 
 def install_ros(environment: Environment) -> None:
@@ -154,7 +175,7 @@ def install_ros(environment: Environment) -> None:
     if environment.jazzy:
         return
     environment.report_progress("installing rclpy (ROS 2 Jazzy) from PyPI")
-    environment.install("-r", REQUIREMENTS / "ros.txt", problem="pip could not install rclpy; is PyPI in reach?")
+    environment.install_requirements("ros", "pip could not install rclpy; is PyPI in reach?")
     missing = missing_for_compilation()
     if missing:
         environment.report_progress(f"tf2_msgs is left out and /tf stays silent: {missing} and run this again")
@@ -174,8 +195,7 @@ def missing_for_compilation() -> str:
 
 def build_tf2_msgs(environment: Environment) -> None:
     """Compile tf2_msgs into the environment, with the ROS build tools of PyPI."""
-    tools = REQUIREMENTS / "tf2_msgs.txt"
-    environment.install("-r", tools, problem="pip could not install the tools for tf2_msgs; is PyPI in reach?")
+    environment.install_requirements("tf2_msgs", "pip could not install the tools for tf2_msgs; is PyPI in reach?")
     mend_wheels(environment)
     build = environment.path / "build_tf2_msgs"
     options = {
@@ -213,7 +233,7 @@ def mend_wheels(environment: Environment) -> None:
 
 def update(environment: Environment) -> None:
     """Bring the environment up to date; do nothing where it is."""
-    needs = f"{sys.version} {ROOT} {environment.jazzy} {environment.constraints.name} {missing_for_compilation()}"
+    needs = f"{sys.version} {ROOT} {environment.jazzy} {environment.floor} {missing_for_compilation()}"
     steps = {
         "project": (digest(REQUIREMENTS, ROOT / "setup.py", ROOT / "setup.cfg", also=needs), install_project),
         "ros": (digest(REQUIREMENTS, TF2_MSGS, also=needs), install_ros),
@@ -235,8 +255,8 @@ def main() -> int:
     arguments = parser.parse_args()
     try:
         jazzy = sourced_jazzy()
-        constraints = REQUIREMENTS / ("floor.txt" if arguments.floor or jazzy else "tested.txt")
-        environment = Environment(ROOT / (".venv-floor" if arguments.floor else ".venv"), jazzy, constraints)
+        folder = ROOT / (".venv-floor" if arguments.floor else ".venv")
+        environment = Environment(folder, jazzy, floor=arguments.floor or jazzy)
         with Path(__file__).open() as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             update(environment)

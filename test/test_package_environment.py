@@ -31,7 +31,7 @@ def environment(environment_module, tmp_path):
     python = tmp_path / "bin" / "python"
     python.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n')
     python.chmod(0o755)
-    return environment_module.Environment(tmp_path, jazzy=False, constraints=tmp_path / "constraints.txt")
+    return environment_module.Environment(tmp_path, jazzy=False, floor=False)
 
 
 def run_script(*command, **variables):
@@ -70,6 +70,31 @@ def test_a_step_that_fails_names_the_purpose_the_cause_and_the_log(environment, 
     log = environment.path / "last_step.log"
     assert str(caught.value) == f"numpy could not be installed (No such version); the whole output is in {log}"
     assert "Collecting numpy" in log.read_text()
+
+
+def pip_calls(environment):
+    """The arguments of each call of pip, in an environment whose interpreter only notes them."""
+    calls = environment.path / "calls.txt"
+    environment.python.write_text(f'#!/bin/sh\necho "$@" >> "{calls}"\n')
+    return lambda: [line.split()[5:] for line in calls.read_text().splitlines()]
+
+
+def test_packages_are_installed_as_locked_and_nothing_is_downloaded_to_build_them(environment, environment_module):
+    calls = pip_calls(environment)
+    environment_module.install_project(environment)
+    packages, project = calls()
+    locked = str(ROOT / "requirements" / "tested.txt")
+    assert packages == ["--require-hashes", "--no-build-isolation", "-r", locked]
+    assert project == ["--no-deps", "--no-build-isolation", "--editable", str(ROOT)]
+
+
+def test_the_oldest_versions_are_constraints(environment, environment_module):
+    environment.floor = True
+    calls = pip_calls(environment)
+    environment_module.install_project(environment)
+    environment.install_requirements("ros", "")
+    floor = ["--constraint", str(ROOT / "requirements" / "floor.txt")]
+    assert calls() == [[*floor, "--editable", f"{ROOT}[test]"], [*floor, "-r", str(ROOT / "requirements" / "ros.in")]]
 
 
 def test_the_ros_wheels_look_for_headers_in_this_environment_and_keep_all_else(environment, environment_module):
