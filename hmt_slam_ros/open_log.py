@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import io
 import lzma
 import zlib
 from pathlib import Path
@@ -11,9 +12,19 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.carmen import is_carmen, open_carmen
 from hmt_slam_ros.logs.rawlog import is_rawlog, open_rawlog
 from hmt_slam_ros.logs.records import SIMULATION_PREFIX, Log, TimeWindow
+from hmt_slam_ros.untrusted_input import open_regular, read_file
 
 _MCAP, _SQLITE, _GZIP, _XZ = b"\x89MCAP0\r\n", b"SQLite format 3\x00", b"\x1f\x8b", b"\xfd7zXZ\x00"
 """First bytes of files."""
+
+MAX_CONTENT_BYTES = 200_000_000
+"""Of a log that is read as a whole, decompressed; the largest public one has 20 MB."""
+
+_FREE_CONTENT, _MAX_RATIO = 16_000_000, 50
+"""Bytes that a packed log may always have, and its content in bytes of the file beyond; logs reach 10."""
+
+_XZ_MEMORY, _PIECE = 200_000_000, 1 << 20
+"""Bytes that the decompression of xz may take besides its result, three times what it needs; and of one step of it."""
 
 
 def open_log(
@@ -40,15 +51,12 @@ def open_log(
 
         return open_simulated(path, window)
     path = Path(path)
-    try:
-        if path.is_dir():
-            return _open_bag(_bag_folder(path), window, scan_topic, odom_topic)
-        head = _read_head(path)
-        for magic, suffix in ((_MCAP, ".mcap"), (_SQLITE, ".db3")):
-            if head.startswith(magic):
-                return _open_bag(_check_suffix(path, suffix), window, scan_topic, odom_topic)
-    except OSError as error:
-        raise HmtSlamError(f"{path} cannot be read ({error.strerror}): give an existing log.") from error
+    if path.is_dir():
+        return _open_bag(_bag_folder(path), window, scan_topic, odom_topic)
+    head = _read_head(path)
+    for magic, suffix in ((_MCAP, ".mcap"), (_SQLITE, ".db3")):
+        if head.startswith(magic):
+            return _open_bag(_check_suffix(path, suffix), window, scan_topic, odom_topic)
     return _open_file(path, head, window)
 
 
@@ -88,7 +96,7 @@ def _bag_folder(path: Path) -> Path:
 
 
 def _read_head(path: Path) -> bytes:
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         head = file.read(16)
     if not head:
         raise HmtSlamError(f"{path} is empty: give a log with scans.")
@@ -102,13 +110,47 @@ def _check_suffix(path: Path, suffix: str) -> Path:
 
 
 def _decompress(path: Path, head: bytes) -> bytes:
-    """The content of a file, decompressed."""
-    content = path.read_bytes()
+    """The content of a file, decompressed up to a limit."""
+    content = read_file(path, MAX_CONTENT_BYTES)
+    limit = min(MAX_CONTENT_BYTES, _FREE_CONTENT + _MAX_RATIO * len(content))
     try:
         if head.startswith(_GZIP):
-            return gzip.decompress(content)
-        if head.startswith(_XZ):
-            return lzma.decompress(content)
+            content = _decompress_gzip(content, limit)
+        elif head.startswith(_XZ):
+            content = _decompress_xz(content, limit)
     except (EOFError, zlib.error, gzip.BadGzipFile, lzma.LZMAError) as error:
         raise HmtSlamError(f"{path} is truncated or damaged ({error}): copy it anew.") from error
+    if len(content) > limit:
+        raise HmtSlamError(
+            f"{path} has more than {limit} bytes of content: give a shorter log, or convert it in parts."
+        )
     return content
+
+
+def _decompress_gzip(content: bytes, limit: int) -> bytes:
+    """The content of all members of a gzip file, up to the limit and a byte."""
+    pieces: list[bytes] = []
+    left = limit + 1
+    with gzip.GzipFile(fileobj=io.BytesIO(content)) as file:
+        while left and (piece := file.read(min(left, _PIECE))):
+            pieces.append(piece)
+            left -= len(piece)
+    return b"".join(pieces)
+
+
+def _decompress_xz(content: bytes, limit: int) -> bytes:
+    """The content of all streams of an xz file, up to the limit and a byte."""
+    pieces: list[bytes] = []
+    left = limit + 1
+    while content and left:
+        decompressor = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY)
+        while not decompressor.eof and left:
+            if decompressor.needs_input and not content:
+                raise EOFError("it ends inside a stream")
+            piece = decompressor.decompress(content, min(left, _PIECE))
+            content = b""
+            pieces.append(piece)
+            left -= len(piece)
+        # Between streams and at the end there may be padding of zeros.
+        content = decompressor.unused_data.lstrip(b"\0") if decompressor.eof else b""
+    return b"".join(pieces)

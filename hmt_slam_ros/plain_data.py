@@ -17,6 +17,7 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 import numpy as np
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.untrusted_input import MAX_INTEGER, shorten
 
 Value = TypeVar("Value")
 Reader = Callable[[object, str], object]
@@ -51,10 +52,19 @@ class PlainDataReader:
     :ivar format_reference: description of the documents, for error messages.
     """
 
-    def __init__(self, format_reference: str, forms: Mapping[type, ReaderFactory]) -> None:
-        """:param forms: {type: factory of readers}, for other types, such as arrays."""
+    def __init__(
+        self,
+        format_reference: str,
+        forms: Mapping[type, ReaderFactory],
+        check: Callable[[Any, str], None] | None = None,
+    ) -> None:
+        """:param forms: {type: factory of readers}, for other types, such as arrays.
+
+        :param check: called with each dataclass or named tuple that was read and its path; raises HmtSlamError where
+            it is not as it has to be.
+        """
         self.format_reference = format_reference
-        self._forms = forms
+        self._forms, self._check = forms, check
         self._readers: dict[tuple[str, Hashable], Reader] = {}
 
     def read(self, content: object, kind: type[Value], path: str) -> Value:
@@ -99,6 +109,7 @@ class PlainDataReader:
     def _object(self, kind: type) -> Reader:
         hints = get_type_hints(kind)
         readers = {name: self._reader(name, hints[name]) for name in field_names(kind)}
+        check = self._check
 
         def read(content: object, path: str) -> object:
             if not isinstance(content, dict):
@@ -109,9 +120,12 @@ class PlainDataReader:
                 )
             for name in content.keys() - readers.keys():
                 raise HmtSlamError(
-                    f"{path}.{name} is unknown: see {self.format_reference} for the form of the document"
+                    f"{path}.{shorten(name)} is unknown: see {self.format_reference} for the form of the document"
                 )
-            return kind(**{name: reader(content[name], f"{path}.{name}") for name, reader in readers.items()})
+            record = kind(**{name: reader(content[name], f"{path}.{name}") for name, reader in readers.items()})
+            if check is not None:
+                check(record, path)
+            return record
 
         return read
 
@@ -180,14 +194,16 @@ class PlainDataReader:
         return read
 
     def _number(self, content: object, path: str) -> float:
-        if not isinstance(content, int | float) or isinstance(content, bool) or not math.isfinite(content):
+        if type(content) is int and abs(content) <= MAX_INTEGER:
+            return float(content)
+        if not isinstance(content, float) or not math.isfinite(content):
             raise self.error_at(path, content, _SCALARS[float][1])
-        return float(content)
+        return content
 
     def error_at(self, path: str, content: object, wanted: str) -> HmtSlamError:
         """The error for content at a path that is not as wanted."""
         return HmtSlamError(
-            f"{path} = {str(content)[:60]} is not {wanted}: see {self.format_reference} for the document's form"
+            f"{path} = {shorten(content)} is not {wanted}: see {self.format_reference} for the document's form"
         )
 
 

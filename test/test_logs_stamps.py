@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -75,8 +76,8 @@ def test_the_clock_never_runs_back_and_advances_within_each_kind(readings):
 
 def _entries(seconds):
     for second in seconds:
-        yield LogEntry(second * 10**9, Odometry, ([0.0, 0.0, 0.0],), precedes_its_scan=True)
-        yield LogEntry(second * 10**9, Scan, ([1.0], 0.0, 0.1, 0.0, 5.0))
+        yield LogEntry(second * 10**9, Odometry, (np.zeros(3),), precedes_its_scan=True)
+        yield LogEntry(second * 10**9, Scan, (np.ones(2, dtype=np.float32), 0.0, 0.1, 0.0, 5.0))
 
 
 def test_a_part_of_a_log_has_the_stamps_of_the_whole():

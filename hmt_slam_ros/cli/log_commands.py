@@ -6,6 +6,7 @@ import argparse
 import json
 from collections.abc import Sequence
 
+from hmt_slam_ros.cli.terminal import report_left_out
 from hmt_slam_ros.doctor.examination import examine
 from hmt_slam_ros.doctor.finding import SEVERITIES, Finding
 from hmt_slam_ros.errors import HmtSlamError
@@ -21,6 +22,7 @@ SOMETHING_WRONG = 1
 def run_convert(options: argparse.Namespace) -> None:
     """Write any log as a rosbag2."""
     log = open_log(options.source, start=options.start or 0.0, duration=options.duration or None)
+    report_left_out(log, options.command)
     write_bag(log, options.destination, storage=options.storage)
     print(f"{options.destination}: {log.scan_count} scans, {log.duration:.1f} s")
 

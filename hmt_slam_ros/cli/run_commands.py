@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.cli.arguments import chosen_configuration
-from hmt_slam_ros.cli.terminal import Progress, summary
+from hmt_slam_ros.cli.terminal import Progress, report_left_out, summary
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
@@ -39,6 +39,7 @@ from hmt_slam_ros.saved_map.folder import HMT_MAP
 def run_map(options: argparse.Namespace) -> None:
     """Map the log, write the output folder and print a summary."""
     configuration, state, log = _initial_state(options)
+    report_left_out(log, options.command)
     log_seconds = log.duration
     with atomic_output(options.out) as folder:
         writer = map_writer(folder)
@@ -123,6 +124,7 @@ def run_replay(options: argparse.Namespace) -> None:
     configuration = chosen_configuration(options)
     check_replaceable(options.out.absolute())
     log = open_log(options.log, start=configuration.robot.start, duration=configuration.robot.duration or None)
+    report_left_out(log, options.command)
     try:
         from hmt_slam_ros.ros.replay import replay  # noqa: PLC0415  the only command that needs ROS
     except ImportError as fault:

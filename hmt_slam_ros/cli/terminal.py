@@ -15,6 +15,8 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, TextIO
 
+from hmt_slam_ros.logs.records import Log, describe_left_out
+
 if TYPE_CHECKING:
     from hmt_slam_ros.results.recorder import Recording
 
@@ -23,6 +25,13 @@ _TTY_PERIOD, _FILE_PERIOD = 0.1, 10.0
 
 _BAR = 24
 """Width of the progress bar, characters."""
+
+
+def report_left_out(log: Log, command: str) -> None:
+    """Say on stderr how many measurements of a log are left out, where there are any."""
+    sentence = describe_left_out(log)
+    if sentence is not None:
+        print(f"hmt_slam {command}: {sentence}", file=sys.stderr)
 
 
 class Progress:

@@ -137,9 +137,9 @@ def _replace_values(node: Node, changes: Mapping[str, Any]) -> Node:
 def _find_parameter(name: str, known: Mapping[str, FlatParameter], document: str) -> FlatParameter:
     if name in known:
         return known[name]
-    near = nearest_names(name, known)
+    near = nearest_names(name, known) if len(name) <= _LONGEST_SHOWN else []
     advice = f"did you mean {' or '.join(near)}?" if near else f"see {document} for the names"
-    raise HmtSlamError(f"there is no parameter '{name}': {advice}")
+    raise HmtSlamError(f"there is no parameter {_show(name)}: {advice}")
 
 
 def nearest_names(name: str, known: Mapping[str, FlatParameter]) -> list[str]:
@@ -151,7 +151,9 @@ def nearest_names(name: str, known: Mapping[str, FlatParameter]) -> list[str]:
 def _check_value(parameter: FlatParameter, value: object) -> Value:
     typed = _convert_type(parameter, value)
     if parameter.choices and typed not in parameter.choices:
-        raise HmtSlamError(f"{parameter.name} = {value} is not a choice: use {' or '.join(parameter.choices)}")
+        raise HmtSlamError(
+            f"{parameter.name} = {_show(value, str)} is not a choice: use {' or '.join(parameter.choices)}"
+        )
     if not isinstance(typed, str) and not _is_in_range(parameter, typed):
         allowed, default = allowed_values(parameter), parameter.default
         raise HmtSlamError(f"{parameter.name} = {value} is out of range: use {allowed} (the default is {default})")
@@ -164,8 +166,14 @@ def _convert_type(parameter: FlatParameter, value: object) -> Value:
     if type(value) is parameter.kind:
         return cast(Value, value)
     raise HmtSlamError(
-        f"{parameter.name} = {value!r} is not {_KIND_NAMES[parameter.kind]}: use {allowed_values(parameter)}"
+        f"{parameter.name} = {_show(value)} is not {_KIND_NAMES[parameter.kind]}: use {allowed_values(parameter)}"
     )
+
+
+def _show(value: object, form: Callable[[object], str] = repr) -> str:
+    """A value as a complaint names it, cut off where it is long."""
+    text = form(value)
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
 def _is_in_range(parameter: FlatParameter, value: float) -> bool:
@@ -173,6 +181,9 @@ def _is_in_range(parameter: FlatParameter, value: float) -> bool:
         return False
     return (parameter.low is None or value >= parameter.low) and (parameter.high is None or value <= parameter.high)
 
+
+_LONGEST_SHOWN = 80
+"""Characters of a value in a complaint."""
 
 _KIND_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
@@ -240,20 +251,9 @@ def read_parameter_file(file: Path) -> dict[str, Any]:
 
 
 def _parse_yaml(file: Path) -> object:
-    import yaml  # noqa: PLC0415  the commands that read no file start faster without it
+    from hmt_slam_ros.untrusted_input import read_yaml  # noqa: PLC0415  commands that read no file start faster
 
-    try:
-        return yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as fault:
-        raise HmtSlamError(f"the configuration {file} cannot be read ({_reason(fault)}): check the path") from fault
-    except yaml.YAMLError as fault:
-        mark = getattr(fault, "problem_mark", None)
-        place = f" at line {mark.line + 1}" if mark is not None else ""
-        raise HmtSlamError(f"the configuration {file} is no valid YAML{place}: correct it there") from fault
-
-
-def _reason(fault: OSError | UnicodeDecodeError) -> str:
-    return fault.strerror or "unknown reason" if isinstance(fault, OSError) else "it is no UTF-8 text"
+    return read_yaml(file)
 
 
 def _is_ros_section(section: object) -> bool:

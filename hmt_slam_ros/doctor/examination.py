@@ -12,6 +12,7 @@ from hmt_slam_ros.doctor.odometry import compare_odometry, odometry_findings
 from hmt_slam_ros.doctor.statistics import Statistics, gather
 from hmt_slam_ros.doctor.timing import rate_findings, stamp_findings
 from hmt_slam_ros.logs import Log
+from hmt_slam_ros.logs.records import describe_left_out
 from hmt_slam_ros.open_log import is_bag, open_log
 
 
@@ -28,7 +29,14 @@ def examine(path: Path, *, start: float = 0.0, duration: float | None = None) ->
 
 def log_findings(log: Log, messages: MessageStatistics | None = None) -> list[Finding]:
     """The findings on an open log, the most serious first."""
-    return sorted_findings(statistics_findings(gather(log, messages)))
+    return sorted_findings([*_left_out_findings(log), *statistics_findings(gather(log, messages))])
+
+
+def _left_out_findings(log: Log) -> Iterator[Finding]:
+    """A finding on the measurements that no process may see."""
+    sentence = describe_left_out(log)
+    if sentence is not None:
+        yield Finding("wrong", "measurements", sentence)
 
 
 def statistics_findings(statistics: Statistics) -> Iterator[Finding]:

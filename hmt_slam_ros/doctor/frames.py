@@ -12,18 +12,17 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.rosbag2 import Reader
 
 from hmt_slam_ros.doctor.finding import Finding
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.bag import (
     DEFAULT_ODOM_TOPIC,
     DEFAULT_SCAN_TOPIC,
     choose_odom_topic,
     choose_scan_topic,
     read_header,
-    read_messages,
-    read_topics,
 )
+from hmt_slam_ros.logs.bag_files import count_messages, read_messages, read_topics
 from hmt_slam_ros.logs.mounting import frame_name, transform_from_message
 from hmt_slam_ros.logs.ros_types import ODOMETRY, TRANSFORMS, RosMessage, deserialize
 
@@ -108,7 +107,10 @@ class TransformCollector:
         """Add a tf2_msgs/TFMessage."""
         for stamped in message.transforms:
             key = (frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id), topic)
-            transform = transform_from_message(stamped.transform)
+            try:
+                transform = transform_from_message(stamped.transform)
+            except HmtSlamError:  # opening the log refused or left it out
+                continue
             first = self._first_transforms.setdefault(key, transform)
             self._message_counts[key] += 1
             self._max_changes[key] = max(self._max_changes.get(key, 0.0), float(np.abs(transform - first).max()))
@@ -129,17 +131,12 @@ def read_message_statistics(path: Path) -> MessageStatistics:
             if message.kind == TRANSFORMS:
                 collector.add(topic, deserialize(message.content, TRANSFORMS))
     return MessageStatistics(
-        _message_counts(path),
+        count_messages(path),
         types,
         dict(headers),
         _odometry_frames(path, odom_topic, collector.transforms),
         collector.transforms,
     )
-
-
-def _message_counts(path: Path) -> dict[str, int]:
-    with Reader(path) as reader:
-        return {topic: info.msgcount for topic, info in reader.topics.items()}
 
 
 def _odometry_frames(path: Path, topic: str | None, transforms: tuple[FrameTransform, ...]) -> tuple[str, str]:

@@ -12,9 +12,9 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float32, Float64, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.topology import RefinementParameters
 from hmt_slam_ros.doctor.frames import MessageStatistics
 from hmt_slam_ros.geometry import se2

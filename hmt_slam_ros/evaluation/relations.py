@@ -17,6 +17,8 @@ from hmt_slam_ros.evaluation.trajectory import StampedPoses, read_odometry_poses
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS, stamp_from_seconds
 from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors.plausibility import MAX_COORDINATE, check_planar_pose
+from hmt_slam_ros.untrusted_input import MAX_TEXT_BYTES, read_text
 
 MAX_TIME_GAP = NANOSECONDS // 10
 """Largest time between a relation's end and the pose taken for it, ns."""
@@ -109,10 +111,7 @@ def read_relations(path: Path) -> Relations:
 
     :raises HmtSlamError: if the file cannot be read, is empty or has a malformed line.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise HmtSlamError(f"{path} cannot be read as relations ({error}): give a file of relations.") from error
+    lines = read_text(path, MAX_TEXT_BYTES).splitlines()
     stamps: list[tuple[int, int]] = []
     poses: list[tuple[float, float, float]] = []
     for number, line in enumerate(lines, start=1):
@@ -121,8 +120,9 @@ def read_relations(path: Path) -> Relations:
             continue
         try:
             x, y, _, _, _, yaw = map(float, fields[2:])
+            check_planar_pose(np.array([x, y, yaw]), "the pose", MAX_COORDINATE)
             stamps.append((stamp_from_seconds(fields[0]), stamp_from_seconds(fields[1])))
-        except ValueError:
+        except (ValueError, HmtSlamError):
             raise HmtSlamError(
                 f"line {number} of {path} is not 't1 t2 x y z roll pitch yaw': mend that line."
             ) from None

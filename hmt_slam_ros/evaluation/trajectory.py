@@ -13,6 +13,8 @@ from hmt_slam_ros.logs import Log
 from hmt_slam_ros.logs.mounting import heading_from_quaternion
 from hmt_slam_ros.logs.stamps import seconds_from_stamp, stamp_from_seconds
 from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.plausibility import MAX_COORDINATE, check_planar_pose, check_quaternion
+from hmt_slam_ros.untrusted_input import MAX_TEXT_BYTES, read_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +49,7 @@ def read_tum(path: Path) -> StampedPoses:
 
     :raises HmtSlamError: if the file cannot be read, is empty or has a malformed line.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise HmtSlamError(f"{path} cannot be read as a trajectory ({error}): give a TUM file.") from error
+    lines = read_text(path, MAX_TEXT_BYTES).splitlines()
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
     for number, line in enumerate(lines, start=1):
@@ -59,8 +58,10 @@ def read_tum(path: Path) -> StampedPoses:
             continue
         try:
             x, y, _, qx, qy, qz, qw = map(float, fields[1:])
+            check_quaternion((qx, qy, qz, qw))
+            check_planar_pose(np.array([x, y, 0.0]), "the pose", MAX_COORDINATE)
             stamps.append(stamp_from_seconds(fields[0]))
-        except ValueError:
+        except (ValueError, HmtSlamError):
             raise HmtSlamError(f"line {number} of {path} is not 't x y z qx qy qz qw': mend that line.") from None
         poses.append((x, y, heading_from_quaternion((qx, qy, qz, qw))))
     if not stamps:

@@ -9,13 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 import yaml
-from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, UInt8
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.grids.traversal import begin_walk, next_cell
+from hmt_slam_ros.own_files import write_file
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.sensors.plausibility import MAX_COORDINATE, check_planar_pose
+from hmt_slam_ros.untrusted_input import read_file, read_yaml
 
 OCCUPIED, FREE, UNKNOWN = np.uint8(0), np.uint8(254), np.uint8(205)
 
@@ -27,6 +30,12 @@ _MARGIN = 0.5
 
 _MAX_CELLS = 1 << 26
 """Cells of an image at most."""
+
+_MAX_IMAGE_BYTES = _MAX_CELLS + 1000
+"""Of map.pgm, whose header has some 20."""
+
+_FINEST, _COARSEST = 1e-3, 1e3
+"""Limits of the resolution of an image that is read, m; that of a map of 10 km is doubled up to some meters."""
 
 _HITS, _MISSES, _LAST_SCAN = 0, 1, 2
 """Layers of the votes."""
@@ -119,7 +128,7 @@ def write_map(directory: Path, image: OccupancyImage) -> None:
     """Write map.pgm and map.yaml."""
     height, width = image.pixels.shape
     header = f"P5\n{width} {height}\n255\n".encode()
-    (directory / "map.pgm").write_bytes(header + np.ascontiguousarray(image.pixels).tobytes())
+    write_file(directory / "map.pgm", header + np.ascontiguousarray(image.pixels).tobytes())
     # 205 reads as (255 - 205) / 255 = 0.1961 occupied: unknown only if free_thresh is not above that.
     description = {
         "image": "map.pgm",
@@ -130,7 +139,7 @@ def write_map(directory: Path, image: OccupancyImage) -> None:
         "occupied_thresh": 0.65,
         "free_thresh": 0.196,
     }
-    (directory / "map.yaml").write_text(yaml.safe_dump(description, sort_keys=False), encoding="utf-8")
+    write_file(directory / "map.yaml", yaml.safe_dump(description, sort_keys=False).encode())
 
 
 def read_map(directory: Path) -> OccupancyImage:
@@ -139,13 +148,17 @@ def read_map(directory: Path) -> OccupancyImage:
     :raises HmtSlamError: where they are missing or have another form.
     """
     try:
-        description = yaml.safe_load((directory / "map.yaml").read_text(encoding="utf-8"))
-        content = (directory / "map.pgm").read_bytes()
+        description = read_yaml(directory / "map.yaml")
+        content = read_file(directory / "map.pgm", _MAX_IMAGE_BYTES)
         magic, size, depth, pixels = content.split(b"\n", 3)
         width, height = (int(number) for number in size.split())
         if (magic, depth) != (b"P5", b"255"):
             raise ValueError(magic)
         image = np.frombuffer(pixels, dtype=np.uint8).reshape(height, width)
-        return OccupancyImage(image, float(description["resolution"]), np.array(description["origin"][:2], dtype=float))
-    except (OSError, ValueError, KeyError, TypeError) as fault:
+        resolution, origin = float(description["resolution"]), np.array(description["origin"][:2], dtype=float)
+        if not (image.size and _FINEST <= resolution <= _COARSEST and origin.shape == (2,)):
+            raise ValueError(resolution)
+        check_planar_pose(origin, "origin", MAX_COORDINATE)
+        return OccupancyImage(image, resolution, origin)
+    except (HmtSlamError, ValueError, KeyError, TypeError) as fault:
         raise HmtSlamError(f"{directory} holds no complete map.pgm and map.yaml: map the log again") from fault

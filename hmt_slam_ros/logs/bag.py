@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
-from itertools import groupby, pairwise
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.rosbag2 import Reader
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs.bag_files import BagMessage, check_bag, read_messages, read_topics
 from hmt_slam_ros.logs.mounting import FrameTree, Mounting, frame_name, heading_from_quaternion, planar_mounting
-from hmt_slam_ros.logs.records import LogRecord, TimeWindow, require_scans
+from hmt_slam_ros.logs.records import LeftOut, LogRecord, TimeWindow, require_scans
 from hmt_slam_ros.logs.ros_types import (
     GROUND_TRUTH_TOPIC,
     LASER_SCAN,
@@ -27,20 +29,19 @@ from hmt_slam_ros.logs.ros_types import (
 )
 from hmt_slam_ros.logs.stamps import NANOSECONDS, running_stamps
 from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.plausibility import (
+    MAX_COORDINATE,
+    check_odometry,
+    check_planar_pose,
+    check_quaternion,
+    check_scan,
+)
 
 DEFAULT_SCAN_TOPIC, DEFAULT_ODOM_TOPIC = "/scan", "/odom"
 """Topics of scans and odometry where the user names none."""
 
 _ODOM_FRAME, _BASE_FRAME = "odom", "base_link"
 """Frame of the odometry (REP 105), and the robot's frame where the odometry has no child frame."""
-
-
-class BagMessage(NamedTuple):
-    """A serialized message: its bag time, ns, its type, and its bytes in CDR."""
-
-    bag_time: int
-    kind: str
-    content: bytes
 
 
 class Header(NamedTuple):
@@ -55,47 +56,6 @@ def read_header(content: bytes) -> Header:
     order = "<" if content[1] & 1 else ">"
     seconds, nanoseconds, length = struct.unpack_from(order + "iII", content, 4)
     return Header(seconds * NANOSECONDS + nanoseconds, content[16 : 15 + length].decode())
-
-
-def read_topics(path: Path) -> dict[str, str]:
-    """{topic: message type} of a bag.
-
-    :raises HmtSlamError: where the bag cannot be opened.
-    """
-    with _damage_as_error(path), Reader(path) as reader:
-        return {connection.topic: connection.msgtype for connection in reader.connections}
-
-
-def read_messages(path: Path, topics: Collection[str]) -> Iterator[BagMessage]:
-    """The messages of some topics in the order of their bag times; of equal bag times, scans come last.
-
-    :raises HmtSlamError: where the bag is damaged.
-    """
-    with _damage_as_error(path), Reader(path) as reader:
-        connections = [connection for connection in reader.connections if connection.topic in topics]
-        if not connections:
-            return
-        messages = (
-            BagMessage(bag_time, connection.msgtype, bytes(content))
-            for connection, bag_time, content in reader.messages(connections)
-        )
-        for _, simultaneous in groupby(messages, key=lambda message: message.bag_time):
-            yield from sorted(simultaneous, key=lambda message: message.kind == LASER_SCAN)
-
-
-@contextmanager
-def _damage_as_error(path: Path) -> Iterator[None]:
-    """A context that turns any exception of the rosbags library into one sentence."""
-    try:
-        yield
-    except HmtSlamError:
-        raise
-    except Exception as error:
-        cause = str(error).strip().rstrip(".") or type(error).__name__
-        raise HmtSlamError(
-            f"{path} is no complete rosbag2, truncated or damaged ({cause}): copy or record it anew, "
-            "or repair it with 'ros2 bag reindex'."
-        ) from error
 
 
 def choose_scan_topic(topics: Mapping[str, str], wanted: str, name: str) -> str:
@@ -136,12 +96,12 @@ def _choose_topic(topics: Mapping[str, str], wanted: str, default: str, kind: st
 
 
 class _Measurement(NamedTuple):
-    """A serialized scan or odometry reading.
+    """A scan or odometry reading as a message.
 
     :ivar bag_time: bag time, ns.
     :ivar source_stamp: stamp of its header, ns.
     :ivar scan_frame: frame of a scan, None for odometry.
-    :ivar content: bytes of the message, or the transform that replaces an odometry reading.
+    :ivar content: message of a scan, or position and rotation of an odometry reading.
     """
 
     bag_time: int
@@ -150,11 +110,19 @@ class _Measurement(NamedTuple):
     content: RosMessage
 
 
-class BagLog:
-    """A rosbag2 whose scans are read from disk when they are needed; the attributes are those of `Log`.
+_MAX_LASERS, _MAX_FRAMES = 32, 2000
+"""Frames of the scans of one topic, and of all transforms."""
 
-    Opening reads the whole bag once, which reveals damage. The source stamp of a record is that of its header. Records
-    have the order of their bag times; of equal bag times, odometry comes before the scan.
+_AT_THE_BASE = Mounting(np.zeros(3), 1.0)
+
+
+class BagLog:
+    """A rosbag2 whose scans are read from disk when they are needed; the attributes are those of
+    `Log` and `PartialLog`.
+
+    Opening reads the whole bag, which reveals damage and the measurements that no process may see. The source stamp of
+    a record is that of its header. Records have the order of their bag times; of equal bag times, odometry comes before
+    the scan.
 
     :param path: a bag folder, or a .mcap or .db3 file.
     :param window: part of the log to read.
@@ -164,18 +132,25 @@ class BagLog:
     """
 
     def __init__(self, path: Path, window: TimeWindow, scan_topic: str, odom_topic: str) -> None:
+        check_bag(path)
         self._path = path
+        self.left_out = LeftOut()
         self.name = path.stem if path.is_file() else path.name
         topics = read_topics(path)
         self._scan_topic = choose_scan_topic(topics, scan_topic, path.name)
         self._odom_topic = choose_odom_topic(topics, odom_topic, path.name)
         self._base_frame = self._find_base_frame()
-        headers = [measurement[:3] for measurement in self._read_measurements()]
+        self._kept: list[bool] = []
+        headers = []
+        for measurement in self._read_measurements():
+            self._kept.append(self.left_out.admits(partial(self._check, measurement)))
+            if self._kept[-1]:
+                headers.append(measurement[:3])
         is_scan = [frame is not None for _, _, frame in headers]
         self._stamps = running_stamps([stamp for _, stamp, _ in headers], is_scan, _precedes_its_scan(headers))
         self._records_in_window = window.select(self._stamps)
         self.scan_count = sum(is_scan[self._records_in_window])
-        require_scans(path.name, self.scan_count, sum(is_scan))
+        require_scans(path.name, self.scan_count, sum(is_scan), self.left_out)
         part = self._stamps[self._records_in_window]
         self.duration = float(part[-1] - part[0]) / NANOSECONDS
         self._true_poses = self._read_true_poses(topics)
@@ -183,7 +158,7 @@ class BagLog:
 
     def records(self) -> Iterator[LogRecord]:
         """All measurements in file order."""
-        for k, measurement in enumerate(self._read_measurements()):
+        for k, measurement in enumerate(itertools.compress(self._read_measurements(), self._kept)):
             if k >= self._records_in_window.stop:
                 return
             if k >= self._records_in_window.start:
@@ -193,47 +168,78 @@ class BagLog:
         """{source stamp, ns: true pose, shape (3,)}, {} where the bag has no ground truth."""
         if topics.get(GROUND_TRUTH_TOPIC) != POSE:
             return {}
-        messages = (deserialize(message.content, POSE) for message in read_messages(self._path, {GROUND_TRUTH_TOPIC}))
-        return {_stamp(message.header): _pose_from_message(message.pose) for message in messages}
+        poses = {}
+        for message in read_messages(self._path, {GROUND_TRUTH_TOPIC}):
+            truth = self._deserialize(message, POSE)
+            pose = poses[_stamp(truth.header)] = _pose_from_parts(truth.pose.position, truth.pose.orientation)
+            check_planar_pose(pose, f"a pose on {GROUND_TRUTH_TOPIC} of {self._path.name}", MAX_COORDINATE)
+        return poses
+
+    def _deserialize(self, message: BagMessage, kind: str) -> RosMessage:
+        """A message of the bag.
+
+        :raises HmtSlamError: where it is damaged.
+        """
+        if message.kind != kind:
+            raise HmtSlamError(
+                f"{self._path.name} has a message of type {message.kind} where {kind} belongs: record it anew."
+            )
+        try:
+            return deserialize(message.content, kind)
+        except HmtSlamError as fault:
+            raise HmtSlamError(f"in {self._path.name}, at {message.bag_time} ns, {fault}") from fault
 
     def _make_record(self, measurement: _Measurement, stamp: int) -> LogRecord:
-        truth = self._true_poses.get(measurement.source_stamp)
+        truth, source = self._true_poses.get(measurement.source_stamp), measurement.source_stamp
         if measurement.scan_frame is not None:
-            message = deserialize(measurement.content, LASER_SCAN)
-            scan = _scan_from_message(message, stamp, self._mountings[measurement.scan_frame])
-            return LogRecord(measurement.source_stamp, scan, truth)
-        if self._odom_topic is None:
-            transform = measurement.content
-            pose = _pose_from_parts(transform.translation, transform.rotation)
-        else:
-            pose = _pose_from_message(deserialize(measurement.content, ODOMETRY).pose.pose)
-        return LogRecord(measurement.source_stamp, Odometry(stamp, pose), truth)
+            mounting = self._mountings[measurement.scan_frame]
+            return LogRecord(source, _scan_from_message(measurement.content, stamp, mounting), truth)
+        position, rotation = measurement.content
+        return LogRecord(source, Odometry(stamp, _pose_from_parts(position, rotation)), truth)
+
+    def _check(self, measurement: _Measurement) -> None:
+        """Check a measurement; the laser's pose is that of no message.
+
+        :raises HmtSlamError: where no process may see it.
+        """
+        stamp = measurement.source_stamp
+        if measurement.scan_frame is not None:
+            scan = _scan_from_message(measurement.content, stamp, _AT_THE_BASE)
+            check_scan(replace(scan, time_increment=0.0))  # which may be wrong, as in `check_measurement`
+            return
+        position, rotation = measurement.content
+        check_quaternion((rotation.x, rotation.y, rotation.z, rotation.w))
+        check_odometry(Odometry(stamp, _pose_from_parts(position, rotation)))
 
     def _read_measurements(self) -> Iterator[_Measurement]:
         for message in read_messages(self._path, {self._scan_topic, self._odom_topic or "/tf"}):
             if message.kind == TRANSFORMS:
                 yield from self._odometry_transforms(message)
+            elif message.kind == LASER_SCAN:
+                scan = self._deserialize(message, LASER_SCAN)
+                yield _Measurement(message.bag_time, _stamp(scan.header), frame_name(scan.header.frame_id), scan)
             else:
-                stamp, frame = read_header(message.content)
-                scan_frame = frame_name(frame) if message.kind == LASER_SCAN else None
-                yield _Measurement(message.bag_time, stamp, scan_frame, message.content)
+                reading = self._deserialize(message, ODOMETRY)
+                pose = reading.pose.pose
+                yield _Measurement(message.bag_time, _stamp(reading.header), None, (pose.position, pose.orientation))
 
     def _odometry_transforms(self, message: BagMessage) -> Iterator[_Measurement]:
-        for stamped in deserialize(message.content, TRANSFORMS).transforms:
+        for stamped in self._deserialize(message, TRANSFORMS).transforms:
             frames = (frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id))
             if frames == (_ODOM_FRAME, self._base_frame):
-                yield _Measurement(message.bag_time, _stamp(stamped.header), None, stamped.transform)
+                parts = (stamped.transform.translation, stamped.transform.rotation)
+                yield _Measurement(message.bag_time, _stamp(stamped.header), None, parts)
 
     def _find_base_frame(self) -> str:
         """The robot's frame: the child frame of the odometry."""
         if self._odom_topic is not None:
             for message in read_messages(self._path, {self._odom_topic}):
-                return frame_name(deserialize(message.content, ODOMETRY).child_frame_id) or _BASE_FRAME
+                return frame_name(self._deserialize(message, ODOMETRY).child_frame_id) or _BASE_FRAME
             raise HmtSlamError(
                 f"{self._path.name} has no message on {self._odom_topic}: record the wheel odometry in it."
             )
         for message in read_messages(self._path, {"/tf"}):
-            for stamped in deserialize(message.content, TRANSFORMS).transforms:
+            for stamped in self._deserialize(message, TRANSFORMS).transforms:
                 if frame_name(stamped.header.frame_id) == _ODOM_FRAME:
                     return frame_name(stamped.child_frame_id)
         raise HmtSlamError(
@@ -243,14 +249,19 @@ class BagLog:
 
     def _find_mountings(self, frames: list[str]) -> dict[str, Mounting]:
         """{scan frame: mounting}, from /tf_static, else from /tf."""
+        if len(frames) > _MAX_LASERS:
+            raise HmtSlamError(
+                f"{self._path.name} has scans of {len(frames)} frames, more than {_MAX_LASERS}: record one laser."
+            )
         mountings: dict[str, Mounting] = {}
         tree = FrameTree()
         for topic in ("/tf_static", "/tf"):
             for message in read_messages(self._path, {topic}):
                 if len(mountings) == len(frames):
                     return mountings
-                tree.add(deserialize(message.content, TRANSFORMS))
-                if topic == "/tf":
+                size = tree.size
+                self._add_transforms(tree, message, topic)
+                if topic == "/tf" and tree.size > size:
                     self._look_up(frames, tree, mountings)
             self._look_up(frames, tree, mountings)
         for frame in frames:
@@ -260,6 +271,20 @@ class BagLog:
                     "record /tf_static with it."
                 )
         return mountings
+
+    def _add_transforms(self, tree: FrameTree, message: BagMessage, topic: str) -> None:
+        """Add a message to the tree; one of /tf that cannot be right is left out, since others follow it.
+
+        :raises HmtSlamError: where one of /tf_static cannot be right.
+        """
+        transforms = self._deserialize(message, TRANSFORMS)
+        try:
+            tree.add(transforms)
+        except HmtSlamError as fault:
+            if topic == "/tf_static":
+                raise HmtSlamError(f"{self._path.name} has a transform on {topic} whose {fault}") from fault
+        if tree.size > _MAX_FRAMES:
+            raise HmtSlamError(f"{self._path.name} has transforms of more than {_MAX_FRAMES} frames: record fewer.")
 
     def _look_up(self, frames: list[str], tree: FrameTree, mountings: dict[str, Mounting]) -> None:
         for frame in frames:
@@ -271,11 +296,6 @@ class BagLog:
 def _stamp(header: RosMessage) -> int:
     """The stamp of a header, ns."""
     return int(header.stamp.sec * NANOSECONDS + header.stamp.nanosec)
-
-
-def _pose_from_message(pose: RosMessage) -> NDArray[np.float64]:
-    """A geometry_msgs/Pose as (x, y, theta), shape (3,), m and rad."""
-    return _pose_from_parts(pose.position, pose.orientation)
 
 
 def _pose_from_parts(position: RosMessage, rotation: RosMessage) -> NDArray[np.float64]:

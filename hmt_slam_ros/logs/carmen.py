@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs.records import InMemoryLog, LogEntry, TimeWindow
+from hmt_slam_ros.logs.records import InMemoryLog, LeftOut, LogEntry, TimeWindow
 from hmt_slam_ros.logs.stamps import stamp_from_seconds
 from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.plausibility import MAX_COORDINATE, MAX_LASER_OFFSET, check_planar_pose
 
 _MIN_REPEATS = 3
 """Least number of equal readings at the maximum of the sensor."""
@@ -72,6 +74,12 @@ _MIN_SCANS_FOR_OFFSET = 10
 _LARGEST_OFFSET = 2.0
 """Largest distance of the laser from the odometry's pose, m: farther away, the pose is a corrected one."""
 
+_MAX_LINE = 1_000_000
+"""Bytes of a line; a scan of 10,000 beams has 100,000."""
+
+_MAX_OFFSETS = 1000
+"""Poses of a laser on the robot in one log."""
+
 _SAME_OFFSET = 2e-3
 """Largest difference of equal offsets, m and rad: poses are written with six decimals."""
 
@@ -107,9 +115,10 @@ class _StampedLine(NamedTuple):
 
 @dataclass
 class _ParsedFile:
-    """The content of a file."""
+    """The content of a file, without the lines of poses that cannot be right."""
 
     readings: list[_StampedLine] = field(default_factory=list)
+    left_out: LeftOut = field(default_factory=LeftOut)
     front_laser_offset: float = 0.0
 
 
@@ -135,7 +144,7 @@ def open_carmen(path: Path, content: bytes, window: TimeWindow) -> InMemoryLog:
     sweeps = [reading.content for reading in parsed.readings if isinstance(reading.content, _Sweep)]
     limits = _range_limits(sweeps)
     mounting = _Mountings(sweeps, parsed.front_laser_offset)
-    return InMemoryLog(_stem(path), list(_entries(parsed.readings, limits, mounting)), window)
+    return InMemoryLog(_stem(path), _entries(parsed.readings, limits, mounting), window, parsed.left_out)
 
 
 def _stem(path: Path) -> str:
@@ -157,14 +166,20 @@ def _parse(content: bytes, name: str) -> _ParsedFile:
     parsed = _ParsedFile()
     # Line by line: splitting all at once would fragment as much memory as the log takes.
     for number, line in enumerate(io.BytesIO(content), start=1):
+        if len(line) > _MAX_LINE:
+            raise HmtSlamError(
+                f"line {number} of {name} has {len(line)} bytes, more than {_MAX_LINE}: copy the log anew."
+            )
         tokens = line.split()
         if not tokens:
             continue
         try:
             if tokens[0] in _PARSERS:
-                parsed.readings.append(_PARSERS[tokens[0]](tokens))
+                reading = _PARSERS[tokens[0]](tokens)
+                if parsed.left_out.admits(partial(_check_poses, reading)):
+                    parsed.readings.append(reading)
             elif tokens[:2] == [b"PARAM", _FRONT_LASER_OFFSET]:
-                parsed.front_laser_offset = float(tokens[2])
+                parsed.front_laser_offset = _front_laser_offset(tokens)
             elif any(kind.startswith(tokens[0]) for kind in _PARSERS):
                 raise ValueError("cut off within its first word")
         except (ValueError, IndexError):
@@ -175,6 +190,25 @@ def _parse(content: bytes, name: str) -> _ParsedFile:
     return parsed
 
 
+def _check_poses(reading: _StampedLine) -> None:
+    """Check the poses of a line, before the mounting of the laser is found from all of them.
+
+    :raises HmtSlamError: where one cannot be right.
+    """
+    if isinstance(reading.content, _Sweep):
+        check_planar_pose(reading.content.robot_pose, "the robot's pose", MAX_COORDINATE)
+        check_planar_pose(reading.content.laser_pose, "the laser's pose", MAX_COORDINATE)
+    else:
+        check_planar_pose(reading.content, "pose", MAX_COORDINATE)
+
+
+def _front_laser_offset(tokens: list[bytes]) -> float:
+    offset = float(tokens[2])
+    if not abs(offset) <= MAX_LASER_OFFSET:
+        raise ValueError("no offset of a laser")
+    return offset
+
+
 def _parse_odom(tokens: list[bytes]) -> _StampedLine:
     """``ODOM x y theta tv rv accel`` and the trailer."""
     return _StampedLine(_stamp(tokens, 7), np.array(_numbers(tokens, 1, 3)))
@@ -182,11 +216,11 @@ def _parse_odom(tokens: list[bytes]) -> _StampedLine:
 
 def _parse_flaser(tokens: list[bytes]) -> _StampedLine:
     """``FLASER n r1..rn x y theta odom_x odom_y odom_theta`` and the trailer."""
-    count = int(tokens[1])
+    count = _count(tokens[1])
     stamp = _stamp(tokens, 2 + count + 6)
     poses = np.array(_numbers(tokens, 2 + count, 6))
     increment = np.pi / max(count - count % 2, 1)
-    ranges = np.array(_numbers(tokens, 2, count), dtype=np.float32)
+    ranges = _ranges(tokens, 2, count)
     return _StampedLine(stamp, _Sweep(ranges, -np.pi / 2, increment, np.inf, poses[3:], poses[:3], is_front=True))
 
 
@@ -197,12 +231,12 @@ def _parse_robotlaser(tokens: list[bytes]) -> _StampedLine:
     m s1..sm laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv`` three safety fields and the trailer.
     """
     start, field_of_view, resolution, maximum = _numbers(tokens, 2, 4)
-    count = int(tokens[8])
-    poses_at = 10 + count + int(tokens[9 + count])
+    count = _count(tokens[8])
+    poses_at = 10 + count + _count(tokens[9 + count])
     stamp = _stamp(tokens, poses_at + 6 + 5)
     poses = np.array(_numbers(tokens, poses_at, 6))
     increment = resolution if resolution > 0.0 else field_of_view / max(count - 1, 1)
-    ranges = np.array(_numbers(tokens, 9, count), dtype=np.float32)
+    ranges = _ranges(tokens, 9, count)
     limit = maximum if maximum > 0.0 else np.inf
     return _StampedLine(stamp, _Sweep(ranges, start, increment, limit, poses[3:], poses[:3], is_front=False))
 
@@ -221,6 +255,18 @@ def _stamp(tokens: list[bytes], at: int) -> int:
     return stamp_from_seconds(tokens[at].decode())
 
 
+def _count(token: bytes) -> int:
+    count = int(token)
+    if count < 0:
+        raise ValueError("fewer than no readings")
+    return count
+
+
+def _ranges(tokens: list[bytes], begin: int, count: int) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):  # beyond float32 there is no return
+        return np.array(_numbers(tokens, begin, count), dtype=np.float32)
+
+
 def _numbers(tokens: list[bytes], begin: int, count: int) -> list[float]:
     return list(map(float, tokens[begin : begin + count]))
 
@@ -230,11 +276,13 @@ def _range_limits(sweeps: Sequence[_Sweep]) -> dict[float, float]:
 
     Sensors that state a maximum often report a smaller value for "no return", which is searched too.
     """
-    limits = {}
-    for stated in {sweep.stated_max: None for sweep in sweeps}:
-        ranges = np.concatenate([sweep.ranges for sweep in sweeps if sweep.stated_max == stated])
-        limits[stated] = min(no_return_threshold(ranges), float(np.float32(stated)))
-    return limits
+    by_maximum: dict[float, list[NDArray[np.float32]]] = {}
+    for sweep in sweeps:
+        by_maximum.setdefault(sweep.stated_max, []).append(sweep.ranges)
+    return {
+        stated: min(no_return_threshold(np.concatenate(ranges)), float(np.float32(stated)))
+        for stated, ranges in by_maximum.items()
+    }
 
 
 class _Mountings:
@@ -246,20 +294,28 @@ class _Mountings:
     """
 
     def __init__(self, sweeps: Sequence[_Sweep], front_laser_offset: float) -> None:
-        self._known: list[NDArray[np.float64]] = []
+        self._known = np.empty((0, 3))
         front = _constant_offset([sweep for sweep in sweeps if sweep.is_front])
         self._front = np.array([front_laser_offset, 0.0, 0.0]) if front is None else front
 
     def laser_pose_of(self, sweep: _Sweep) -> NDArray[np.float64]:
-        """``base_T_laser``, shape (3,); offsets that differ by rounding are replaced by the first of them."""
+        """``base_T_laser``, shape (3,); offsets that differ by rounding are replaced by the first of them.
+
+        :raises HmtSlamError: where there are too many.
+        """
         if sweep.is_front:
             return self._front
         offset = se2.between(sweep.robot_pose, sweep.laser_pose)
-        for known in self._known:
-            if np.all(np.abs(se2.between(known, offset)) < _SAME_OFFSET):
-                return known
-        self._known.append(np.round(offset, 4))
-        return self._known[-1]
+        same = np.flatnonzero((np.abs(se2.between(self._known, offset)) < _SAME_OFFSET).all(axis=1))
+        if not same.size:
+            if len(self._known) == _MAX_OFFSETS:
+                raise HmtSlamError(
+                    f"the laser has more than {_MAX_OFFSETS} poses on the robot: give a log with a laser that is fixed."
+                )
+            self._known = np.vstack([self._known, np.round(offset, 4)])
+            return self._known[-1]
+        known: NDArray[np.float64] = self._known[same[0]]
+        return known
 
 
 def _constant_offset(sweeps: Sequence[_Sweep]) -> NDArray[np.float64] | None:

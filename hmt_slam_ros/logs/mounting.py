@@ -9,9 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.sensors.plausibility import MAX_COORDINATE, check_planar_pose, check_quaternion
 
 if TYPE_CHECKING:
     from hmt_slam_ros.logs.ros_types import RosMessage
+
+_MAX_CHAIN = 100
+"""Frames from one to the root of a tree."""
 
 _LARGEST_TILT = np.deg2rad(10.0)
 """Largest tilt of a scan plane, rad: beyond it, ranges differ too much from distances on the floor plan."""
@@ -65,8 +69,14 @@ def transform_from_quaternion(translation: ArrayLike, quaternion: ArrayLike) -> 
 
 
 def transform_from_message(transform: RosMessage) -> NDArray[np.float64]:
-    """The homogeneous transform, shape (4, 4), m, of a geometry_msgs/Transform."""
+    """The homogeneous transform, shape (4, 4), m, of a geometry_msgs/Transform.
+
+    :raises HmtSlamError: where a number is not finite or the rotation is none.
+    """
     shift, turn = transform.translation, transform.rotation
+    check_quaternion((turn.x, turn.y, turn.z, turn.w), "rotation")
+    for part in (shift.x, shift.y, shift.z):
+        check_planar_pose(np.array([part, 0.0]), "translation", MAX_COORDINATE)
     return transform_from_quaternion((shift.x, shift.y, shift.z), (turn.x, turn.y, turn.z, turn.w))
 
 
@@ -94,6 +104,11 @@ class FrameTree:
         self._newest = newest
         self._parents: dict[str, tuple[str, NDArray[np.float64]]] = {}
 
+    @property
+    def size(self) -> int:
+        """Number of frames with a parent."""
+        return len(self._parents)
+
     def add(self, message: RosMessage) -> None:
         """Add a tf2_msgs/TFMessage."""
         for stamped in message.transforms:
@@ -114,7 +129,7 @@ class FrameTree:
     def _ancestor_transforms(self, frame: str) -> dict[str, NDArray[np.float64]]:
         """{ancestor: ``ancestor_T_frame``}, from the frame itself to the root."""
         chain = {frame: np.eye(4)}
-        while frame in self._parents and self._parents[frame][0] not in chain:
+        while frame in self._parents and self._parents[frame][0] not in chain and len(chain) < _MAX_CHAIN:
             parent, transform = self._parents[frame]
             chain[parent] = transform @ chain[frame]
             frame = parent

@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,8 +20,14 @@ from numpy.typing import NDArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.mounting import planar_mounting, transform_from_quaternion
-from hmt_slam_ros.logs.records import InMemoryLog, LogEntry, TimeWindow
+from hmt_slam_ros.logs.records import InMemoryLog, LeftOut, LogEntry, TimeWindow
 from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.plausibility import (
+    MAX_COORDINATE,
+    MAX_LASER_OFFSET,
+    QUATERNION_TOLERANCE,
+    check_planar_pose,
+)
 
 _END_OF_OBJECT = 0x88
 """Byte at the end of an object."""
@@ -30,6 +37,9 @@ _ODOMETRY_METHOD = 0
 
 _TICKS_TO_1970 = 116_444_736_000_000_000
 """MRPT counts ticks of 100 ns from the year 1601: ticks until 1970."""
+
+_MAX_DEPTH = 16
+"""Objects within each other; the deepest of a rawlog has 5."""
 
 _Kind = TypeVar("_Kind")
 
@@ -106,6 +116,7 @@ class ObjectStream:
         self._content = content
         self._name = name
         self._offset = 0
+        self._depth = 0
 
     def __iter__(self) -> Iterator[object]:
         """All objects.
@@ -125,7 +136,13 @@ class ObjectStream:
                 f"{self._name} holds an object of class {class_name!r}, which is not known here: "
                 "remove such objects with MRPT's rawlog-edit first."
             )
+        if self._depth == _MAX_DEPTH:
+            raise HmtSlamError(
+                f"{self._name} is damaged, its objects nest deeper than {_MAX_DEPTH}: copy the file anew."
+            )
+        self._depth += 1
         result = reader(self, self.integer("B"))
+        self._depth -= 1
         if self.integer("B") != _END_OF_OBJECT:
             raise HmtSlamError(f"{self._name} is damaged inside an object of class {class_name}: copy the file anew.")
         return result
@@ -140,9 +157,17 @@ class ObjectStream:
             raise HmtSlamError(f"{self._name} is damaged, one object lies where another belongs: copy the file anew.")
         return result
 
-    def pose(self) -> NDArray[np.float64]:
-        """A nested object that is a pose or a matrix."""
-        return self.nested_object(np.ndarray)
+    def pose(self, *shape: int) -> NDArray[np.float64]:
+        """A nested object that is a pose or a matrix of a shape.
+
+        :raises HmtSlamError: where it is of another kind or shape.
+        """
+        pose = self.nested_object(np.ndarray)
+        if pose.shape != shape:
+            raise HmtSlamError(
+                f"{self._name} is damaged, a matrix of {pose.shape} lies where {shape} belongs: copy the file anew."
+            )
+        return pose
 
     def integer(self, code: str) -> int:
         """An integer, by its code in the struct module."""
@@ -198,11 +223,12 @@ def _pose_3d(stream: ObjectStream, version: int) -> NDArray[np.float64]:
     """Homogeneous transform, shape (4, 4)."""
     stream.check_version("CPose3D", version, newest=3)
     if version < 2:
-        return stream.pose()
+        return stream.pose(4, 4)
     translation = stream.numbers("f8", 3)
     if version == 2:
         w, x, y, z = stream.numbers("f8", 4)
-        return transform_from_quaternion(translation, (x, y, z, w))
+        norm = float(np.linalg.norm((x, y, z, w)))
+        return transform_from_quaternion(translation, (x, y, z, w)) if norm > 0.0 else np.full((4, 4), np.nan)
     transform = np.eye(4)
     transform[:3, 3] = translation
     transform[:3, :3] = stream.numbers("f8", 9).reshape(3, 3)
@@ -212,9 +238,9 @@ def _pose_3d(stream: ObjectStream, version: int) -> NDArray[np.float64]:
 def _pose_gaussian(stream: ObjectStream, version: int) -> NDArray[np.float64]:
     """The mean, shape (3,)."""
     stream.check_version("CPosePDFGaussian", version, newest=2)
-    mean = stream.pose()
+    mean = stream.pose(3)
     if version == 0:
-        stream.pose()
+        stream.pose(3, 3)
     else:
         stream.numbers("f8" if version == 2 else "f4", 6)  # upper triangle of the covariance
     return mean
@@ -223,7 +249,7 @@ def _pose_gaussian(stream: ObjectStream, version: int) -> NDArray[np.float64]:
 def _movement(stream: ObjectStream, version: int) -> RobotMovement:
     stream.check_version("CActionRobotMovement2D", version, newest=7, oldest=4)
     method = stream.integer("i")
-    increment = stream.pose()
+    increment = stream.pose(3)
     if method == _ODOMETRY_METHOD:
         stream.numbers("i4", 1)  # the motion model: its choice, ...
         stream.numbers("f4", 6)  # ... Gaussian parameters, ...
@@ -249,7 +275,7 @@ def _skip_velocities_and_encoders(stream: ObjectStream, *, old: bool) -> None:
 
 def _odometry_reading(stream: ObjectStream, version: int) -> OdometryReading:
     stream.check_version("CObservationOdometry", version, newest=2)
-    pose = stream.pose()
+    pose = stream.pose(3)
     stream.skip_text()
     ticks = stream.integer("Q")
     if version >= 1:
@@ -267,9 +293,9 @@ def _odometry_reading(stream: ObjectStream, version: int) -> OdometryReading:
 def _range_scan(stream: ObjectStream, version: int) -> RangeScan:
     stream.check_version("CObservation2DRangeScan", version, newest=8, oldest=4)
     aperture, right_to_left, max_range = stream.real("f"), bool(stream.integer("?")), stream.real("f")
-    sensor_pose = stream.pose()
+    sensor_pose = stream.pose(4, 4)
     if version < 6:
-        stream.pose()  # covariance of the sensor's pose
+        stream.nested_object(np.ndarray)  # covariance of the sensor's pose
     count = stream.integer("I")
     ranges, valid = stream.numbers("f4", count), stream.numbers("u1", count)
     stream.real("f")  # standard deviation of a range
@@ -326,8 +352,9 @@ def open_rawlog(path: Path, content: bytes, window: TimeWindow) -> InMemoryLog:
     """
     objects = list(ObjectStream(content, path.name))
     absolute = any(isinstance(reading, OdometryReading) for reading in _observations(objects))
-    entries = _entries(objects, path.name, with_increments=not absolute)
-    return InMemoryLog(path.stem, list(entries), window)
+    left_out = LeftOut()
+    entries = _entries(objects, path.name, left_out, with_increments=not absolute)
+    return InMemoryLog(path.stem, entries, window, left_out)
 
 
 def _observations(objects: Iterable[object]) -> Iterator[object]:
@@ -338,21 +365,34 @@ def _observations(objects: Iterable[object]) -> Iterator[object]:
             yield item
 
 
-def _entries(objects: Iterable[object], name: str, *, with_increments: bool) -> Iterator[LogEntry]:
+def _entries(objects: Iterable[object], name: str, left_out: LeftOut, *, with_increments: bool) -> Iterator[LogEntry]:
     odom_T_base = np.zeros(3)
     due = with_increments  # at the first scan, and at the first one after an action
     for item in _observations(objects):
         if isinstance(item, ActionCollection) and with_increments:
-            odom_T_base = se2.compose(odom_T_base, _increment(item, name))
-            due = True
+            increment = _increment(item, name)
+            if left_out.admits(partial(check_planar_pose, increment, "a movement", MAX_COORDINATE)):
+                odom_T_base = se2.compose(odom_T_base, increment)
+                due = True
         elif isinstance(item, OdometryReading):
             yield LogEntry(_stamp(item.ticks, name), Odometry, (item.pose,))
         elif isinstance(item, RangeScan):
             stamp = _stamp(item.ticks, name)
+            if not left_out.admits(partial(_check_sensor_pose, item)):
+                continue
             if due:
                 yield LogEntry(stamp, Odometry, (odom_T_base,), precedes_its_scan=True)
             due = False
             yield LogEntry(stamp, Scan, _scan_fields(item, name))
+
+
+def _check_sensor_pose(scan: RangeScan) -> None:
+    """Check that the laser's pose is finite; where it is tilted, the log is refused.
+
+    :raises HmtSlamError: where it is not.
+    """
+    check_planar_pose(scan.sensor_pose[:2, 3], "the laser's position", MAX_LASER_OFFSET)
+    check_planar_pose(scan.sensor_pose[:3, :3].ravel(), "the laser's rotation", 1.0 + QUATERNION_TOLERANCE)
 
 
 def _stamp(ticks: int, name: str) -> int:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.stamps import NANOSECONDS, running_stamps
 from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.plausibility import check_odometry, check_scan
 
 SIMULATION_PREFIX = "sim:"
 """Prefix of the names of simulated logs."""
@@ -57,6 +59,51 @@ class Log(Protocol):
 
         :raises HmtSlamError: at a damaged record, where opening the log could not find the damage.
         """
+
+
+@dataclass
+class LeftOut:
+    """The measurements of a log that no process may see, since a number in them cannot be right.
+
+    :ivar count: how many scans and odometry readings were left out.
+    :ivar reason: what is wrong with the first of them.
+    """
+
+    count: int = 0
+    reason: str = ""
+
+    def admits(self, check: Callable[[], object]) -> bool:
+        """Whether a measurement passes a check; one that does not is counted.
+
+        :param check: raises `HmtSlamError` for a measurement that is to be left out.
+        """
+        try:
+            check()
+        except HmtSlamError as fault:
+            self.count += 1
+            self.reason = self.reason or str(fault).partition(":")[0]
+            return False
+        return True
+
+
+@runtime_checkable
+class PartialLog(Protocol):
+    """A log of which measurements may have been left out."""
+
+    @property
+    def left_out(self) -> LeftOut:
+        """Those of the whole log."""
+
+
+def describe_left_out(log: Log) -> str | None:
+    """A sentence on the measurements of a log that were left out, None where there are none."""
+    left_out = log.left_out if isinstance(log, PartialLog) else LeftOut()
+    if not left_out.count:
+        return None
+    return (
+        f"{left_out.count} measurements of {log.name} are left out, in the first of them {left_out.reason}: "
+        "correct the driver that sent them, or go on without them."
+    )
 
 
 class LogEntry(NamedTuple):
@@ -106,11 +153,17 @@ class TimeWindow:
         return slice(low, int(np.searchsorted(stamps, last, side="right")))
 
 
-def require_scans(name: str, in_window: int, in_log: int) -> None:
+def require_scans(name: str, in_window: int, in_log: int, left_out: LeftOut | None = None) -> None:
     """Check that a log, and the selected part of it, has scans.
 
+    :param left_out: measurements that no process may see, which are not counted.
     :raises HmtSlamError: where one has none; says which.
     """
+    if not in_log and left_out is not None and left_out.count:
+        raise HmtSlamError(
+            f"{name} holds no laser scan that can be used, in the first of {left_out.count} measurements "
+            f"{left_out.reason}: correct the driver and record anew."
+        )
     if not in_log:
         raise HmtSlamError(f"{name} holds no laser scan: give a log in which scans were recorded.")
     if not in_window:
@@ -118,12 +171,18 @@ def require_scans(name: str, in_window: int, in_log: int) -> None:
 
 
 class InMemoryLog:
-    """A log with all measurements in memory; the attributes are those of `Log`.
+    """A log with all measurements in memory; the attributes are those of `Log` and `PartialLog`.
 
+    :param entries: all measurements; those that no process may see are left out.
+    :param left_out: those that the reader of the format left out before, to which they are added.
     :raises HmtSlamError: where there is no scan.
     """
 
-    def __init__(self, name: str, entries: Sequence[LogEntry], window: TimeWindow) -> None:
+    def __init__(
+        self, name: str, entries: Iterable[LogEntry], window: TimeWindow, left_out: LeftOut | None = None
+    ) -> None:
+        self.left_out = left_out or LeftOut()
+        entries = _plausible_entries(entries, self.left_out)
         is_scan = [entry.kind is Scan for entry in entries]
         stamps = running_stamps(
             [entry.source_stamp for entry in entries], is_scan, [entry.precedes_its_scan for entry in entries]
@@ -131,7 +190,7 @@ class InMemoryLog:
         part = window.select(stamps)
         self.name = name
         self.scan_count = sum(is_scan[part])
-        require_scans(name, self.scan_count, sum(is_scan))
+        require_scans(name, self.scan_count, sum(is_scan), self.left_out)
         self._entries = entries[part]
         self._stamps = stamps[part]
         self.duration = float(self._stamps[-1] - self._stamps[0]) / NANOSECONDS
@@ -140,3 +199,28 @@ class InMemoryLog:
         """All measurements in file order."""
         for entry, stamp in zip(self._entries, self._stamps.tolist(), strict=True):
             yield LogRecord(entry.source_stamp, entry.kind(stamp, *entry.fields))
+
+
+def _plausible_entries(entries: Iterable[LogEntry], left_out: LeftOut) -> list[LogEntry]:
+    """The entries that a process may see; odometry whose scan is left out belongs to none."""
+    kept: list[LogEntry] = []
+    for entry in entries:
+        if left_out.admits(partial(check_measurement, entry)):
+            kept.append(entry)
+        elif entry.kind is Scan and kept and kept[-1].precedes_its_scan:
+            kept[-1] = kept[-1]._replace(precedes_its_scan=False)
+    return kept
+
+
+def check_measurement(entry: LogEntry) -> None:
+    """Check a measurement by its source stamp and fields.
+
+    The time from beam to beam may be wrong, since `SweepCheck` takes such scans as if measured at one moment.
+
+    :raises HmtSlamError: where no process may see it.
+    """
+    measurement = entry.kind(entry.source_stamp, *entry.fields)
+    if isinstance(measurement, Scan):
+        check_scan(replace(measurement, time_increment=0.0))
+    else:
+        check_odometry(measurement)

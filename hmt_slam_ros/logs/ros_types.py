@@ -8,6 +8,9 @@ from typing import Any, TypeAlias
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.untrusted_input import shorten
+
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -27,5 +30,13 @@ def typestore() -> Typestore:
 
 
 def deserialize(content: bytes, message_type: str) -> RosMessage:
-    """The message of its bytes in CDR."""
-    return typestore().deserialize_cdr(content, message_type)
+    """The message of its bytes in CDR.
+
+    :raises HmtSlamError: where they are none of the type.
+    """
+    try:
+        return typestore().deserialize_cdr(content, message_type)
+    except Exception as fault:  # whatever the library meets in a damaged message
+        raise HmtSlamError(
+            f"a message of type {message_type} is damaged ({shorten(fault)}): record it anew, or leave it out."
+        ) from fault

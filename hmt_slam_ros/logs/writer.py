@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterable, Iterator
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs.mcap_file import write_checksums
 from hmt_slam_ros.logs.records import Log, LogRecord
 from hmt_slam_ros.logs.ros_types import (
     GROUND_TRUTH_TOPIC,
@@ -24,6 +26,7 @@ from hmt_slam_ros.logs.ros_types import (
     typestore,
 )
 from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.own_files import ScratchFolder, replace_folder
 from hmt_slam_ros.sensors import Odometry, Scan
 
 ODOM_FRAME, BASE_FRAME, LASER_FRAME, WORLD_FRAME = "odom", "base_link", "laser", "world"
@@ -47,16 +50,28 @@ def write_bag(log: Log, destination: Path, *, storage: str = "mcap") -> None:
     """
     if storage not in _STORAGES:
         raise HmtSlamError(f"storage {storage!r} is not known: choose one of {', '.join(_STORAGES)}.")
-    if destination.exists():
-        raise HmtSlamError(f"{destination} exists already: choose another name or remove it first.")
+    target = destination.absolute()
     try:
-        destination.absolute().parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".partial-", dir=destination.absolute().parent) as folder:
-            finished = Path(folder) / destination.name
-            _write(log, finished, _STORAGES[storage])
-            finished.rename(destination)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        scratch = ScratchFolder(target, target.parent)
     except OSError as error:
-        raise HmtSlamError(f"{destination} cannot be written ({error.strerror}): choose another folder.") from error
+        raise HmtSlamError(
+            f"{target.parent} cannot be written to ({error.strerror}): make room, or choose another folder."
+        ) from error
+    try:
+        # Only now, when what an earlier process left is gone.
+        if destination.exists():
+            raise HmtSlamError(f"{destination} exists already: choose another name or remove it first.")
+        finished = scratch.path / target.name
+        _write(log, finished, _STORAGES[storage])
+        replace_folder(finished, target)
+    except (OSError, sqlite3.Error) as error:
+        reason = getattr(error, "strerror", None) or error  # sqlite's faults have no strerror
+        raise HmtSlamError(
+            f"{destination} cannot be written ({reason}): make room, or choose another folder."
+        ) from error
+    finally:
+        scratch.remove()
 
 
 def _write(log: Log, folder: Path, storage: StoragePlugin) -> None:
@@ -64,7 +79,9 @@ def _write(log: Log, folder: Path, storage: StoragePlugin) -> None:
     writer = Writer(folder, version=9, storage_plugin=storage)
     if storage == StoragePlugin.MCAP:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    checksums: list[int] = []
     with writer:
+        _collect_checksums(writer.storage, checksums)
         types = {"/scan": LASER_SCAN, "/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS}
         if any(record.true_pose is not None for record in islice(log.records(), 1)):
             types[GROUND_TRUTH_TOPIC] = POSE
@@ -75,6 +92,21 @@ def _write(log: Log, folder: Path, storage: StoragePlugin) -> None:
         for topic, stamp, message in _messages(log.records(), frames):
             content = typestore().serialize_cdr(message, types[topic])
             writer.write(connections[topic], stamp, content)
+    if storage == StoragePlugin.MCAP:
+        write_checksums(folder / f"{folder.name}.mcap", checksums)
+
+
+def _collect_checksums(storage: object, checksums: list[int]) -> None:
+    """Append the CRC-32 of each chunk of an mcap file before it is compressed; the library writes none."""
+    compress: Callable[[bytes], bytes] | None = getattr(storage, "compressor", None)
+    if compress is None:  # sqlite3
+        return
+
+    def compress_checked(records: bytes) -> bytes:
+        checksums.append(crc32(records))
+        return compress(records)
+
+    setattr(storage, "compressor", compress_checked)  # noqa: B010  it has no common type
 
 
 def _qos(topic: str) -> Qos:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensors.motion_model import path_standard_deviations
+from hmt_slam_ros.sensors.relative_motion import path_standard_deviations
 
 ACCELERATION = 0.5
 """Largest acceleration of the robot, m/s^2."""

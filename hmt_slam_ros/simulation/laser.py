@@ -9,10 +9,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.grids.traversal import GridWalk, next_cell
 from hmt_slam_ros.random_streams import Purpose, random_stream

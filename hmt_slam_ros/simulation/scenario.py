@@ -87,6 +87,9 @@ _SECOND = 1e9
 _CLOSED = 1e-6
 """Largest distance between both ends of a closed route, m."""
 
+_MAX_WAYPOINTS, _MAX_READINGS, _MAX_COMPARISONS = 10_000, 5e6, 2e9
+"""Way-points of all laps, odometry readings, and points of the path times walls."""
+
 _STEP = 0.1
 """Time between two points of the path whose clearance is checked, s."""
 
@@ -111,9 +114,14 @@ class Scenario:
     def __init__(self, building: Building, settings: Settings) -> None:
         building = change_since_first_visit(building, settings)
         self.settings, self.building = settings, building
+        if len(building.route) * settings.laps > _MAX_WAYPOINTS:
+            raise HmtSlamError(
+                f"{settings.laps} laps of {len(building.route)} way-points are more than {_MAX_WAYPOINTS}: drive fewer."
+            )
         route = driven_route(building.route, settings.laps)
         path = path_through(route, settings.rounding)
         self.drive: Drive = drive_along(path, settings.speed, math.radians(settings.turn_rate))
+        _check_effort(self.drive, building, settings)
         self.laser = Laser(settings)
         self.walls: WallIndex = wall_index(building.walls)
         self._furniture_schedule = schedule_furniture(building, self.walls, self.drive, settings)
@@ -196,6 +204,20 @@ class Scenario:
                     f"the route passes {free[nearest]:.2f} m from {name} at ({x:.1f}, {y:.1f}), and the robot's radius "
                     f"is {self.settings.radius:g} m: move a way-point, or choose a smaller radius or rounding."
                 )
+
+
+def _check_effort(drive: Drive, building: Building, settings: Settings) -> None:
+    """Check that a drive can be computed in seconds.
+
+    :raises HmtSlamError: where it is too long.
+    """
+    readings = drive.duration * settings.rate * settings.readings
+    comparisons = drive.duration / _STEP * (len(building.walls) + 4 * len(building.furniture))
+    if not (readings <= _MAX_READINGS and comparisons <= _MAX_COMPARISONS):
+        raise HmtSlamError(
+            f"the drive takes {drive.duration:.0f} s among {len(building.walls)} walls: choose a shorter route, fewer "
+            "laps, a larger speed or fewer walls."
+        )
 
 
 def driven_route(route: NDArray[np.float64], laps: int) -> NDArray[np.float64]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration.flat import Value
@@ -18,6 +18,7 @@ from hmt_slam_ros.simulation import corridors
 from hmt_slam_ros.simulation.building import Building, outline_of_cells
 from hmt_slam_ros.simulation.institute import institute
 from hmt_slam_ros.simulation.settings import Settings
+from hmt_slam_ros.untrusted_input import read_file, read_yaml, shorten
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,15 @@ _KEYS = ("walls", "furniture", "route", "settings", "image", "resolution", "orig
 _IGNORED = ("free_thresh", "mode")
 """Keys of map_server that have no effect here."""
 
+_MAX_ROWS, _MAX_LENGTH = 20_000, 1e4
+"""Of a table of a world: rows, and the magnitude of its numbers, m or degrees."""
+
+_FINEST, _COARSEST = 1e-3, 10.0
+"""Limits of the resolution of an image, m."""
+
+_MAX_PIXELS = 1 << 26
+"""Of an image of a world."""
+
 
 def read_world(path: Path) -> tuple[Building, dict[str, Any]]:
     """The building and the settings of a world file.
@@ -80,9 +90,9 @@ def read_world(path: Path) -> tuple[Building, dict[str, Any]]:
     :raises HmtSlamError: if file or image cannot be read, a key is unknown, or a table is malformed.
     """
     content = _content(path)
-    unknown = sorted(set(content) - {*_KEYS, *_IGNORED})
+    unknown = [key for key in content if key not in (*_KEYS, *_IGNORED)]
     if unknown:
-        raise HmtSlamError(f"{path} has an unknown key {unknown[0]!r}: use {', '.join(_KEYS)}.")
+        raise HmtSlamError(f"{path} has an unknown key {shorten(unknown[0])!r}: use {', '.join(_KEYS)}.")
     walls = [_table(path, content, "walls", 4)]
     if "image" in content:
         walls.append(_walls_of_image(path, content))
@@ -92,7 +102,7 @@ def read_world(path: Path) -> tuple[Building, dict[str, Any]]:
     furniture[:, 2] = np.deg2rad(furniture[:, 2])
     settings = content.get("settings") or {}
     if not isinstance(settings, Mapping):
-        raise HmtSlamError(f"settings in {path} is {settings!r}: write lines such as 'range: 8.0' below it.")
+        raise HmtSlamError(f"settings in {path} is {shorten(settings)}: write lines such as 'range: 8.0' below it.")
     return Building(np.concatenate(walls), route, furniture), dict(settings)
 
 
@@ -109,11 +119,7 @@ def walls_of_image(occupied: NDArray[np.bool_], resolution: float, origin: NDArr
 
 
 def _content(path: Path) -> Mapping[str, Any]:
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as fault:
-        reason = str(fault).replace("\n", " ")
-        raise HmtSlamError(f"the world {path} cannot be read ({reason}): give a YAML file.") from fault
+    content = read_yaml(path)
     if not isinstance(content, Mapping):
         raise HmtSlamError(f"the world {path} holds no keys: write lines such as 'route: [[0, 0], [5, 0]]'.")
     return content
@@ -124,27 +130,40 @@ def _table(path: Path, content: Mapping[str, Any], key: str, columns: int) -> ND
     try:
         rows = np.array(content.get(key) or [], dtype=np.float64).reshape(-1, columns)
         lengths = {len(row) for row in content.get(key) or []}
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         lengths = {0}
     if lengths - {columns} or not np.isfinite(rows).all():
         raise HmtSlamError(f"{key} in {path} is no list of rows of {columns} numbers: correct it.")
+    if len(rows) > _MAX_ROWS or np.abs(rows).max(initial=0.0) > _MAX_LENGTH:
+        raise HmtSlamError(
+            f"{key} in {path} has more than {_MAX_ROWS} rows or a number beyond {_MAX_LENGTH:g}: give a smaller world."
+        )
     return rows
 
 
 def _walls_of_image(path: Path, content: Mapping[str, Any]) -> NDArray[np.float64]:
     from matplotlib.image import imread  # noqa: PLC0415  slow to import, and seldom needed
+    from PIL.Image import open as open_image  # noqa: PLC0415
 
     file = path.parent / str(content["image"])
     try:
         resolution, threshold = float(content["resolution"]), float(content.get("occupied_thresh", 0.65))
         origin = np.array(content.get("origin", (0.0, 0.0, 0.0)), dtype=np.float64).reshape(3)
     except (KeyError, TypeError, ValueError) as fault:
-        raise HmtSlamError(f"{path} lacks resolution or has a wrong origin ({fault}): write map_server's.") from fault
+        raise HmtSlamError(
+            f"{path} lacks resolution or has a wrong origin ({shorten(fault)}): write map_server's."
+        ) from fault
     try:
-        pixels = np.asarray(imread(file))
-    except (OSError, ValueError, SyntaxError) as fault:
-        raise HmtSlamError(f"the image {file} cannot be read ({fault}): give a PGM or PNG file.") from fault
+        image = read_file(file, 4 * _MAX_PIXELS)
+        size = open_image(io.BytesIO(image)).size
+        if size[0] * size[1] > _MAX_PIXELS:
+            raise ValueError(f"it has {size[0]} x {size[1]} pixels")
+        pixels = np.asarray(imread(io.BytesIO(image), format=file.suffix[1:].lower() or "png"))
+    except Exception as fault:  # whatever Pillow meets in a damaged image
+        raise HmtSlamError(f"the image {file} cannot be read ({shorten(fault)}): give a PGM or PNG file.") from fault
     brightness = pixels / 255.0 if pixels.dtype == np.uint8 else pixels.astype(np.float64)
     gray = brightness if brightness.ndim == 2 else brightness[..., : min(3, brightness.shape[2])].mean(axis=2)
+    if not (_FINEST <= resolution <= _COARSEST and np.abs(origin).max() <= _MAX_LENGTH):
+        raise HmtSlamError(f"{path} has resolution {resolution:g} and origin {origin.tolist()}: write map_server's.")
     occupancy = gray if content.get("negate") else 1.0 - gray
     return walls_of_image(occupancy > threshold, resolution, origin)

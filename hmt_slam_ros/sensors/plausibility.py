@@ -1,0 +1,104 @@
+"""What a scan and an odometry reading have to be before any process sees them.
+
+Drivers send NaN, infinities and zero angles, logs are damaged, clocks run wild. Such a measurement is refused with the
+value and the remedy, the same in the readers of logs and on the topics; the rest of the log or drive goes on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.sensors.odometry import Odometry
+from hmt_slam_ros.sensors.scan import Scan
+
+MAX_BEAMS = 100_000
+"""Of a scan; planar range finders have up to some thousands."""
+
+MIN_ANGLE_INCREMENT = 1e-5
+"""rad between two beams; the finest lasers have 1e-3."""
+
+MAX_SWEEP_ANGLE = 4.0 * math.pi
+"""rad of all beams of a scan together."""
+
+MAX_SWEEP_DURATION = 60.0
+"""Seconds from the first beam of a scan to the last."""
+
+MAX_LASER_OFFSET = 100.0
+"""m from the robot's base to its laser."""
+
+MAX_COORDINATE = 1e7
+"""m from the origin of the odometry, beyond any drive; a float64 keeps 2 nm there."""
+
+MAX_STAMP = 2**62
+"""ns, in the year 2116; beyond it sums of stamps no longer fit into 64 bits."""
+
+QUATERNION_TOLERANCE = 1e-2
+"""By which the norm of a rotation's quaternion may differ from 1; float32 differs by 1e-7."""
+
+
+def check_scan(scan: Scan) -> Scan:
+    """The scan, where it is one.
+
+    :raises HmtSlamError: names the field, its value and the remedy.
+    """
+    _check_stamp(scan.stamp)
+    _require(scan.ranges.size <= MAX_BEAMS, "ranges", scan.ranges.size, f"at most {MAX_BEAMS} beams")
+    for name in ("angle_min", "angle_increment", "range_min", "time_increment"):
+        _require(math.isfinite(getattr(scan, name)), name, getattr(scan, name), "a finite number")
+    increment = abs(scan.angle_increment)
+    if scan.ranges.size > 1:
+        most = MAX_SWEEP_ANGLE / (scan.ranges.size - 1)
+        wanted = f"{MIN_ANGLE_INCREMENT:g} to {most:g} rad between {scan.ranges.size} beams"
+        _require(MIN_ANGLE_INCREMENT <= increment <= most, "angle_increment", scan.angle_increment, wanted)
+    _require(abs(scan.angle_min) <= MAX_SWEEP_ANGLE, "angle_min", scan.angle_min, "within 4 pi rad")
+    _require(scan.range_min >= 0.0, "range_min", scan.range_min, "0 m or more")
+    _require(scan.range_max > scan.range_min, "range_max", scan.range_max, f"beyond range_min, {scan.range_min:g} m")
+    _require(scan.time_increment >= 0.0, "time_increment", scan.time_increment, "0 s or more")
+    _require(
+        scan.sweep_duration <= MAX_SWEEP_DURATION, "time_increment", scan.time_increment, "a sweep of at most 60 s"
+    )
+    check_planar_pose(scan.laser_pose, "the laser's pose", MAX_LASER_OFFSET)
+    return scan
+
+
+def check_odometry(reading: Odometry) -> Odometry:
+    """The reading, where it is one.
+
+    :raises HmtSlamError: names the field, its value and the remedy.
+    """
+    _check_stamp(reading.stamp)
+    check_planar_pose(reading.pose, "pose", MAX_COORDINATE)
+    return reading
+
+
+def check_planar_pose(pose: NDArray[np.float64], name: str, reach: float) -> None:
+    """Check that a pose (x, y, theta) is finite and near.
+
+    :param reach: largest magnitude of x and y, m.
+    :raises HmtSlamError: where it is not.
+    """
+    near = bool(np.isfinite(pose).all()) and max(abs(float(pose[0])), abs(float(pose[1]))) <= reach
+    _require(near, name, pose.tolist(), f"finite, with x and y within {reach:g} m")
+
+
+def check_quaternion(quaternion: Sequence[float], name: str = "orientation") -> None:
+    """Check that (x, y, z, w) is a rotation.
+
+    :raises HmtSlamError: where a number is not finite or the norm is not 1.
+    """
+    norm = math.hypot(*quaternion) if all(map(math.isfinite, quaternion)) else math.nan
+    _require(abs(norm - 1.0) <= QUATERNION_TOLERANCE, name, tuple(quaternion), "a quaternion of norm 1")
+
+
+def _check_stamp(stamp: int) -> None:
+    _require(0 <= stamp <= MAX_STAMP, "stamp", stamp, "a time between the years 1970 and 2116")
+
+
+def _require(holds: bool, name: str, value: object, wanted: str) -> None:
+    if not holds:
+        raise HmtSlamError(f"{name} = {value} is not {wanted}: correct the driver, or leave the message out")
