@@ -15,7 +15,8 @@ import pytest
 
 from hmt_slam_ros.arrays import Bool, Float32, Float64
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter, replace_folder
+from hmt_slam_ros.own_files import replace_folder
+from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter
 from hmt_slam_ros.saved_map.reference import document_reference
 from hmt_slam_ros.sensors import Scan
 
@@ -270,7 +271,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from test_saved_map import write_folder
-from hmt_slam_ros.saved_map.folder import replace_folder
+from hmt_slam_ros.own_files import replace_folder
 
 target, turn = Path(sys.argv[1]), 0
 while True:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from hmt_slam_ros.hybrid_map.surroundings import stack_poses
 from hmt_slam_ros.landmarks.area_classes import AreaClassifier
 from hmt_slam_ros.landmarks.landmarks import KIND_NAMES
 from hmt_slam_ros.landmarks.portals import Portal, find_portals
+from hmt_slam_ros.own_files import write_file
 from hmt_slam_ros.places.area_views import AreaViewCache
 from hmt_slam_ros.places.chart import NODE_KIND_NAMES, Chart, ChartNode, build_chart
 from hmt_slam_ros.places.observation_graph import TRACK_NAMES, LandmarkSequence
@@ -87,7 +89,7 @@ def write_places(directory: Path, area_poses: Mapping[int, PoseGaussian], chart:
         "places": [_place_entry(chart.name(k), area_poses[node.area], node) for k, node in enumerate(chart.nodes)],
         "ways": [_edge_entry(edge) for edge in chart.edges],
     }
-    (directory / PLACES).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_file(directory / PLACES, (json.dumps(document, indent=1) + "\n").encode())
     return directory / PLACES
 
 
@@ -165,12 +167,14 @@ def export_topology(directory: Path) -> tuple[Path, Path, Path]:
     portals = find_portals(hybrid_map, landmarks, saved.configuration.features)
     for a, b, arc in hybrid_map.all_arcs():
         graph.add_edge(a, b, **_pose_values(arc.pose), closure=arc.closure, **_portal_attributes(portals, (a, b)))
-    nx.write_graphml_xml(graph, directory / TOPOLOGY)
+    graphml = io.BytesIO()
+    nx.write_graphml_xml(graph, graphml)
+    write_file(directory / TOPOLOGY, graphml.getvalue())
     document = {
         "areas": {str(area): [_landmark_entry(landmark) for landmark in known] for area, known in landmarks.items()},
         "portals": [_portal_entry(portal) for portal in portals],
     }
-    (directory / LANDMARKS).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_file(directory / LANDMARKS, (json.dumps(document, indent=1) + "\n").encode())
     chart = build_chart(hybrid_map, views, saved.configuration.features)
     return directory / TOPOLOGY, directory / LANDMARKS, write_places(directory, saved.area_poses, chart)
 

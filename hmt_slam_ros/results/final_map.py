@@ -37,8 +37,8 @@ from hmt_slam_ros.registration.scan_to_scan import (
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses
 from hmt_slam_ros.results.trajectories import Trajectory, trajectory_in_map
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.motion_model import path_covariance
 from hmt_slam_ros.sensors.odometry import OdometryBuffer, deskew_scan
+from hmt_slam_ros.sensors.relative_motion import path_covariance
 from hmt_slam_ros.sensors.scan import SweepCheck
 
 _ITERATIONS = 2

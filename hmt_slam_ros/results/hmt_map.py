@@ -24,6 +24,7 @@ from hmt_slam_ros.results.log_reading import LogProgress
 from hmt_slam_ros.results.record import RunRecord
 from hmt_slam_ros.results.trajectories import RelativeTrajectory
 from hmt_slam_ros.saved_map.folder import CONFIGURATION, FORMAT, VERSION, FileRecord, FolderReader, FolderWriter
+from hmt_slam_ros.saved_map.validation import check_run_state
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,4 +176,6 @@ def read_run_state(directory: Path) -> tuple[RunState, Configuration]:
             "hmt_slam map wrote, or start nodes from one that nodes saved"
         )
     state = RunState.from_parts({name: folder.read(name, kind) for name, kind in PARTS.items()})
-    return state, load_configuration(directory / CONFIGURATION)
+    configuration = load_configuration(directory / CONFIGURATION)
+    check_run_state(state.parts, configuration)
+    return state, configuration

@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import platform
-import shutil
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -23,27 +21,28 @@ from hmt_slam_ros.configuration import Configuration, as_nested
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import StampedPoses, write_tum
 from hmt_slam_ros.grids.occupancy_map import occupancy_image, write_map
+from hmt_slam_ros.own_files import ScratchFolder, is_remains_of, replace_folder
 from hmt_slam_ros.results.export import LANDMARKS, PLACES, TOPOLOGY
 from hmt_slam_ros.results.final_map import FinalMap
 from hmt_slam_ros.results.hmt_map import MapWriter
 from hmt_slam_ros.results.record import TopologyProbability
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses
-from hmt_slam_ros.saved_map.folder import HMT_MAP, MANIFEST, replace_folder
+from hmt_slam_ros.saved_map.folder import FORMAT, HMT_MAP, MANIFEST, foreign_entry
 from hmt_slam_ros.sensors import Scan
 
 EARLIER_LOGS = "earlier"
 """Folder of the trajectories of earlier logs: 1.tum, 2.tum and so on."""
 
-OUTPUT_NAMES = frozenset(
+STAGES = "stages"
+"""Folder of the trajectories before each step of the final refinement."""
+
+OUTPUT_FILES = frozenset(
     {
         "trajectory.tum",
         "trajectory_online.tum",
-        "stages",
-        EARLIER_LOGS,
         "map.pgm",
         "map.yaml",
         "map.png",
-        HMT_MAP,
         "graph.g2o",
         TOPOLOGY,
         LANDMARKS,
@@ -55,7 +54,10 @@ OUTPUT_NAMES = frozenset(
         "cost.png",
     }
 )
-"""All names in output folders. A folder with any other name in it is never replaced."""
+"""All files of output folders; beside them are :data:`STAGES`, :data:`EARLIER_LOGS` and the map."""
+
+_STAGE_FILES = frozenset({"filter.tum", "arcs.tum", "keyframes.tum"})
+"""All files in :data:`STAGES`."""
 
 _LIBRARIES = ("numpy", "scipy", "networkx", "numba", "rosbags", "matplotlib")
 """Libraries whose versions the report has."""
@@ -98,11 +100,11 @@ def atomic_output(directory: Path) -> Iterator[Path]:
     check_replaceable(target)
     existing = next(parent for parent in target.parents if parent.exists())
     try:
-        scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.partial-", dir=existing))
+        scratch = ScratchFolder(target, existing)
     except OSError as fault:
         raise HmtSlamError(f"{existing} cannot be written to ({fault.strerror}): choose another --out") from fault
     try:
-        folder = scratch / "new"
+        folder = scratch.path / "new"
         folder.mkdir()
         yield folder
         check_replaceable(target)
@@ -111,7 +113,7 @@ def atomic_output(directory: Path) -> Iterator[Path]:
     except OSError as fault:
         raise HmtSlamError(f"{directory} cannot be written ({fault.strerror}): choose another --out") from fault
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        scratch.remove()
 
 
 def check_replaceable(directory: Path) -> None:
@@ -124,11 +126,38 @@ def check_replaceable(directory: Path) -> None:
     blocking = next((parent for parent in directory.parents if parent.exists() and not parent.is_dir()), None)
     if blocking is not None:
         raise HmtSlamError(f"{directory} cannot be made since {blocking} is not a folder: choose another --out")
-    names = {entry.name for entry in directory.iterdir()} if directory.exists() else set()
-    strange = sorted(names - OUTPUT_NAMES)
-    if strange or (names and not (directory / HMT_MAP / MANIFEST).is_file()):
-        found = strange[0] if strange else min(names)
+    foreign = _foreign_entry(directory) if directory.exists() else None
+    if foreign is not None:
+        found = foreign.relative_to(directory)
         raise HmtSlamError(f"{directory} is not an output folder, it holds {found}: choose another --out or empty it")
+
+
+def _foreign_entry(directory: Path) -> Path | None:
+    """The first entry of a folder, at any depth, that no run wrote; None where there is none."""
+    entries = sorted(directory.iterdir())
+    if entries and not (directory / HMT_MAP / MANIFEST).is_file():
+        return next((entry for entry in entries if entry.name not in OUTPUT_FILES), entries[0])
+    return next((foreign for entry in entries if (foreign := _foreign_part(entry)) is not None), None)
+
+
+def _foreign_part(entry: Path) -> Path | None:
+    """An entry of an output folder, or one below it, that no run wrote; None where there is none."""
+    if entry.is_symlink():
+        return entry
+    if entry.is_file():
+        own = entry.name in OUTPUT_FILES or is_remains_of(entry, OUTPUT_FILES)
+        return None if own else entry
+    if entry.name == HMT_MAP:
+        return foreign_entry(entry, FORMAT)
+    if not entry.is_dir() or entry.name not in (STAGES, EARLIER_LOGS):
+        return entry
+    return next((file for file in sorted(entry.iterdir()) if not _is_trajectory(file)), None)
+
+
+def _is_trajectory(file: Path) -> bool:
+    """Whether an entry of the folder of stages or of earlier logs is one of those that a run writes."""
+    named = file.name in _STAGE_FILES if file.parent.name == STAGES else file.suffix == ".tum" and file.stem.isdecimal()
+    return named and file.is_file() and not file.is_symlink()
 
 
 def write_output(
@@ -166,8 +195,8 @@ def _write_trajectories(directory: Path, final: FinalMap, source_stamps: NDArray
     """Write the trajectories of the newest log, and the final ones of the earlier logs."""
     recording = final.recording
     trajectories = {"trajectory": recording.trajectory, "trajectory_online": recording.online_trajectory}
-    trajectories |= {f"stages/{name}": trajectory for name, trajectory in final.stages.items()}
-    (directory / "stages").mkdir()
+    trajectories |= {f"{STAGES}/{name}": trajectory for name, trajectory in final.stages.items()}
+    (directory / STAGES).mkdir()
     newest = slice(recording.first_scans[-1], None)
     for name, trajectory in trajectories.items():
         write_tum(directory / f"{name}.tum", StampedPoses(source_stamps[newest], trajectory[newest]))

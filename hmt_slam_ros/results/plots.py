@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 import csv
+import io
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -23,7 +24,9 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.grids.occupancy_map import OccupancyImage, read_map
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.own_files import write_file
 from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
+from hmt_slam_ros.untrusted_input import MAX_TEXT_BYTES, read_text
 
 Color = tuple[float, float, float]
 
@@ -167,10 +170,14 @@ def _map_title(hybrid_map: HybridMap, path: NDArray[np.float64]) -> str:
     return f"areas: {len(hybrid_map.area_ids())}   arcs: {len(arcs)}   loop closures: {closures}   path: {length:.0f} m"
 
 
+_PROBABILITY_COLUMNS = ("stamp", "keyframe", "hypothesis", "probability", "accepted")
+"""Columns of pmf.csv that are drawn."""
+
+
 def plot_probabilities(directory: Path) -> Path:
     """Draw pmf.png: the probabilities of the hypotheses at every keyframe event, Eq. (14), and their number."""
     table = read_table(directory / "pmf.csv")
-    if not table["stamp"].size:
+    if not set(_PROBABILITY_COLUMNS) <= set(table) or not table["stamp"].size:
         raise HmtSlamError(f"{directory / 'pmf.csv'} holds no probabilities: map the log again")
     minutes = (table["stamp"] - table["stamp"][0]) / 60e9
     firsts = np.flatnonzero(np.diff(table["keyframe"], prepend=-1))
@@ -237,11 +244,11 @@ def read_table(path: Path) -> dict[str, NDArray[np.float64]]:
     :raises HmtSlamError: where the file is missing or damaged.
     """
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            names = next(csv.reader(file))
-            rows = [[float(text) for text in line] for line in csv.reader(file)]
-        columns = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
-    except (OSError, ValueError, StopIteration) as fault:
+        names, *lines = csv.reader(io.StringIO(read_text(path, MAX_TEXT_BYTES), newline=""))
+        columns = np.array([[float(text) for text in line] for line in lines]).reshape(len(lines), len(names))
+        if not np.isfinite(columns).all():
+            raise ValueError("a number that is not finite")
+    except (HmtSlamError, ValueError, csv.Error) as fault:
         raise HmtSlamError(f"{path} is missing or damaged: map the log again") from fault
     return {name: columns[:, k] for k, name in enumerate(names)}
 
@@ -252,5 +259,7 @@ def _color_of(number: int) -> Color:
 
 
 def _save(figure: Figure, path: Path) -> Path:
-    figure.savefig(path, dpi=_DPI)
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=_DPI)
+    write_file(path, picture.getvalue())
     return path

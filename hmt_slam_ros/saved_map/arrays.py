@@ -12,9 +12,16 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.plain_data import Reader
+from hmt_slam_ros.untrusted_input import shorten
 
 _ALIGNMENT = 8
 """Alignment of arrays in the file, bytes."""
+
+_MAX_AXES = 4
+"""Axes of an array; none of the package has more than 3."""
+
+_MAX_SIZE = 2**31
+"""Elements along an axis."""
 
 
 class Sink(Protocol):
@@ -48,6 +55,7 @@ class ArrayReader:
     def __init__(self, content: bytes) -> None:
         """:param content: content of the file."""
         self._content = content
+        self._unread = len(content)
 
     def reader(self, field: str, kind: Hashable) -> Reader:  # noqa: ARG002  the annotation has the type
         """The reader of arrays with the annotated type; it makes copies."""
@@ -56,16 +64,30 @@ class ArrayReader:
 
         def read(content: object, path: str) -> NDArray[Any]:
             match content:
-                case {"type": str(found), "shape": list(shape), "at": int(at)} if found == name:
+                case {"type": str(found), "shape": list(shape), "at": int(at)} if found == name and _is_shape(shape):
                     count = math.prod(shape)
-                    if 0 <= at <= len(self._content) - count * size:
-                        flat = np.frombuffer(self._content, wanted.newbyteorder("<"), count, at)
-                        return flat.reshape(shape).astype(wanted)
+                    # Each byte belongs to one array: a document cannot hold more than its file.
+                    self._unread -= count * size
+                    if 0 <= at <= len(self._content) - count * size and self._unread >= 0:
+                        return self._array(wanted, shape, at)
             raise HmtSlamError(
-                f"{path} = {str(content)[:60]} is not an array of {name}: see docs/reference/map_format.md"
+                f"{path} = {shorten(str(content)[:100])} is not an array of {name}: see docs/reference/map_format.md"
             )
 
         return read
+
+    def _array(self, wanted: np.dtype[Any], shape: list[int], at: int) -> NDArray[Any]:
+        """A copy of the array with a shape at an offset, bytes."""
+        count = math.prod(shape)
+        if wanted.kind == "b":  # a byte that is neither 0 nor 1 would be no boolean
+            return (np.frombuffer(self._content, np.uint8, count, at) != 0).reshape(shape)
+        flat = np.frombuffer(self._content, wanted.newbyteorder("<"), count, at)
+        return flat.reshape(shape).astype(wanted)
+
+
+def _is_shape(shape: list[object]) -> bool:
+    """Whether a list is the shape of an array: at most 4 sizes, each an integer that is not negative."""
+    return len(shape) <= _MAX_AXES and all(type(size) is int and 0 <= size <= _MAX_SIZE for size in shape)
 
 
 @cache

@@ -5,12 +5,10 @@ The manifest lists every file with its size and SHA-256, and has an SHA-256 of i
 
 from __future__ import annotations
 
-import ctypes
-import errno
 import gc
 import hashlib
 import json
-import os
+import stat
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,7 +21,9 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.plain_data import PlainDataReader, ReaderFactory, to_plain
 from hmt_slam_ros.saved_map.arrays import ArrayReader, ArrayWriter
 from hmt_slam_ros.saved_map.scans import ScanReader, ScanTable, ScanWriter
+from hmt_slam_ros.saved_map.validation import check_record
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.untrusted_input import MAX_FILE_BYTES, is_short_text, parse_json, read_file, shorten
 
 FORMAT, VERSION = "hmt_map", 18
 """Format of a saved map, and the version of its documents."""
@@ -46,60 +46,35 @@ FORMAT_DOC = "docs/reference/map_format.md"
 _REMEDY = "take a copy that is whole, or map the log again"
 """Advice for a damaged folder."""
 
-_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
-"""Arguments of renameat2(2): paths are relative to the working directory; exchange two names."""
+_MAX_MANIFEST_BYTES = 1_000_000
+"""Of a manifest; that of a map has 3,000."""
+
+_MAX_JSON_BYTES = 1_000_000_000
+"""Of a document without its arrays; that of a map of 1,000 areas has some millions."""
 
 Document = TypeVar("Document")
 
 
-def replace_folder(new: Path, target: Path) -> None:
-    """Exchange a folder with ``target``, or move it there where ``target`` does not exist.
+def foreign_entry(folder: Path, kind: str) -> Path | None:
+    """What keeps a folder from being one of documents that the package wrote, None where nothing does.
 
-    :param new: complete folder on the same file system.
-    :raises OSError: where the folder cannot be moved.
+    :param kind: format of the folder; the version may be any.
+    :returns: the manifest where it is missing or of something else, or an entry that it does not list.
     """
-    _flush(new)
-    if not target.exists():
-        new.rename(target)
-    elif not _exchange(new, target):
-        # The file system cannot exchange two names: for a moment, there is no target.
-        aside = new.with_name(f"{new.name}.old")
-        target.rename(aside)
-        new.rename(target)
-        aside.rename(new)
-    _flush_folder(target.parent)
-
-
-def _exchange(one: Path, other: Path) -> bool:
-    """Exchange two names; returns False where the file system cannot."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    if not hasattr(libc, "renameat2"):
-        return False
-    if libc.renameat2(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0:
-        return True
-    fault = ctypes.get_errno()
-    if fault in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
-        return False
-    raise OSError(fault, os.strerror(fault), str(other))
-
-
-def _flush(folder: Path) -> None:
-    """Flush a folder and all in it to the disk."""
-    for entry in folder.iterdir():
-        if entry.is_dir():
-            _flush(entry)
-        else:
-            with entry.open("rb") as file:
-                os.fsync(file.fileno())
-    _flush_folder(folder)
-
-
-def _flush_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    manifest = folder / MANIFEST
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        content = parse_json(read_file(manifest, _MAX_MANIFEST_BYTES), shorten(manifest))
+    except HmtSlamError:
+        return manifest
+    files = content.get("files") if isinstance(content, dict) and content.get("format") == kind else None
+    if not isinstance(files, dict) or manifest.is_symlink():
+        return manifest
+    own = {*files, MANIFEST}
+    return next((entry for entry in sorted(folder.iterdir()) if entry.name not in own or not _is_file(entry)), None)
+
+
+def _is_file(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink()
 
 
 @dataclass(frozen=True)
@@ -196,39 +171,47 @@ class FolderReader:
         """
         self._directory = directory
         manifest = self._read_manifest(kind, version)
-        self.names = frozenset(manifest["files"])
+        self._sizes = {name: entry["bytes"] for name, entry in manifest["files"].items()}
+        self.names = frozenset(self._sizes)
         for name, entry in manifest["files"].items():
             self._check_file(name, entry["bytes"], entry["sha256"])
         self._scans = ScanReader(self._read_document(SCANS, ScanTable, {}))
 
     def _read_manifest(self, kind: str, version: int) -> dict[str, Any]:
-        path = self._directory / MANIFEST
+        path, shown = self._directory / MANIFEST, shorten(self._directory)
         try:
-            manifest = json.loads(path.read_text(encoding="utf-8"))
-        except OSError as fault:
-            raise HmtSlamError(
-                f"{self._directory} holds no {kind}, there is no {MANIFEST} to read ({fault.strerror}): give an "
-                f"output folder, or the {kind} in it"
-            ) from fault
-        except ValueError as fault:
-            raise HmtSlamError(f"{path} is truncated or damaged, it is no JSON: {_REMEDY}") from fault
+            manifest = parse_json(read_file(path, _MAX_MANIFEST_BYTES), shorten(path))
+        except HmtSlamError as fault:
+            if isinstance(fault.__cause__, OSError):
+                raise HmtSlamError(
+                    f"{shown} holds no {kind}, there is no {MANIFEST} to read ({fault.__cause__.strerror}): give an "
+                    f"output folder, or the {kind} in it"
+                ) from fault
+            if isinstance(fault.__cause__, ValueError):
+                raise HmtSlamError(f"{path} is truncated or damaged, it is no JSON: {_REMEDY}") from fault
+            raise
         if not isinstance(manifest, dict) or manifest.get("format") != kind:
             raise HmtSlamError(f"{path} is of something else than a {kind}: give an output folder, or the {kind} in it")
         if manifest.get("version") != version:
             raise HmtSlamError(
-                f"{self._directory} is a {kind} of version {manifest.get('version')}, this program reads version "
+                f"{shown} is a {kind} of version {shorten(manifest.get('version'))}, this program reads version "
                 f"{version}: map the log again"
             )
         if manifest.get("sha256") != _manifest_digest(manifest):
             raise HmtSlamError(f"{path} is damaged, it is not as it was written: {_REMEDY}")
+        _check_entries(manifest.get("files"), path)
         return manifest
 
     def _check_file(self, name: str, size: int, digest: str) -> None:
         path = self._directory / name
         try:
-            found = path.stat().st_size
-            if found != size:
-                raise HmtSlamError(f"{path} is truncated or damaged, it has {found} of {size} bytes: {_REMEDY}")
+            status = path.stat()
+            if not stat.S_ISREG(status.st_mode):
+                raise HmtSlamError(f"{path} is no regular file: {_REMEDY}")
+            if status.st_size != size:
+                raise HmtSlamError(
+                    f"{path} is truncated or damaged, it has {status.st_size} of {size} bytes: {_REMEDY}"
+                )
             with path.open("rb") as file:
                 same = hashlib.file_digest(file, "sha256").hexdigest() == digest
         except OSError as fault:
@@ -246,10 +229,34 @@ class FolderReader:
         return self._read_document(name, kind, {Scan: self._scans.reader})
 
     def _read_document(self, name: str, kind: type[Document], forms: Mapping[type, ReaderFactory]) -> Document:
-        arrays = ArrayReader((self._directory / f"{name}.bin").read_bytes())
+        for file in (f"{name}.json", f"{name}.bin"):
+            if file not in self.names:
+                raise HmtSlamError(f"{self._directory / MANIFEST} does not list {file}: {_REMEDY}")
+        arrays = ArrayReader(self._read_file(f"{name}.bin"))
         with _without_garbage_collection():
-            content = json.loads((self._directory / f"{name}.json").read_text(encoding="utf-8"))
-            return PlainDataReader(FORMAT_DOC, {np.ndarray: arrays.reader, **forms}).read(content, kind, name)
+            content = parse_json(self._read_file(f"{name}.json"), f"{name}.json of the map", _MAX_JSON_BYTES)
+            forms = {np.ndarray: arrays.reader, **forms}
+            return PlainDataReader(FORMAT_DOC, forms, check_record).read(content, kind, name)
+
+    def _read_file(self, name: str) -> bytes:
+        return read_file(self._directory / name, self._sizes[name])
+
+
+def _check_entries(files: object, path: Path) -> None:
+    """Check that the entries of a manifest are files of its folder.
+
+    :raises HmtSlamError: where one has another form, or a name that leads elsewhere.
+    """
+    if not isinstance(files, dict):
+        raise HmtSlamError(f"{path} lists no files: {_REMEDY}")
+    for name, entry in files.items():
+        if not is_short_text(name) or "/" in name or name in ("", ".", "..", MANIFEST):
+            raise HmtSlamError(f"{path} lists {shorten(name)}, which is no file of its folder: {_REMEDY}")
+        match entry:
+            case {"bytes": int(size), "sha256": str()} if 0 <= size <= MAX_FILE_BYTES:
+                pass
+            case _:
+                raise HmtSlamError(f"{path} lists {name} without its bytes and SHA-256: {_REMEDY}")
 
 
 @contextmanager

@@ -11,6 +11,10 @@ from hmt_slam_ros.arrays import Float32, Float64, Int64
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.plain_data import Reader
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.sensors.plausibility import check_scan
+from hmt_slam_ros.untrusted_input import shorten
+
+_TABLE = "scans"
 
 _GEOMETRY = ("angle_min", "angle_increment", "range_min", "range_max", "time_increment")
 """Fields of a scan in the columns of ``ScanTable.geometry``."""
@@ -118,16 +122,26 @@ class ScanReader:
     """Reads the scans of documents: the same object for the same name."""
 
     def __init__(self, table: ScanTable) -> None:
-        """:param table: table of all scans."""
+        """:param table: table of all scans, of which the sizes are checked.
+
+        :raises HmtSlamError: where one is none that the readers of logs would let pass.
+        """
         self._scans = table.to_scans()
+        for name, scan in self._scans.items():
+            try:
+                check_scan(scan)
+            except HmtSlamError as fault:
+                raise HmtSlamError(
+                    f"{_TABLE}[{name}] of the map is no scan ({fault}): take a copy that is whole, or map the log again"
+                ) from fault
 
     def reader(self, field: str, kind: Hashable) -> Reader:  # noqa: ARG002  all scans have one type
         """The reader of scans by their names."""
 
         def read(content: object, path: str) -> Scan:
-            if not isinstance(content, int) or content not in self._scans:
+            if type(content) is not int or content not in self._scans:
                 raise HmtSlamError(
-                    f"{path} = {str(content)[:60]} is no scan of the map: see docs/reference/map_format.md"
+                    f"{path} = {shorten(content)} is no scan of the map: see docs/reference/map_format.md"
                 )
             return self._scans[content]
 
