@@ -4,6 +4,7 @@ import http.client
 import io
 import json
 import socket
+from dataclasses import replace
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -175,14 +176,53 @@ def test_a_port_in_use_and_an_address_that_is_none_are_reported_in_a_sentence(bo
         PageServer(board, "here", 0)
 
 
-def test_browsers_beyond_the_twentieth_stream_are_refused(server):
+def test_browsers_beyond_the_twentieth_stream_take_the_place_of_the_oldest(server):
     port = int(server.url.rsplit(":", 1)[1].strip("/"))
     streams = [http.client.HTTPConnection("127.0.0.1", port, timeout=10) for _ in range(21)]
+    answers = []
     for stream in streams:
         stream.request("GET", "/news")
-    assert sorted(stream.getresponse().status for stream in streams) == [200] * 20 + [503]
+        answers.append(stream.getresponse())
+    assert [answer.status for answer in answers] == [200] * 21
+    assert answers[0].read().startswith(b"data: ")  # and ends
     for stream in streams:
         stream.close()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 10**5000], ids=["nan", "infinity", "5001 digits"])
+def test_what_is_no_json_does_not_reach_the_page(board, value):
+    with pytest.raises(HmtSlamError, match="robot of the page is no JSON"):
+        board.put("robot", {"pose": [value]})
+    assert json.loads(json.dumps(board.wait_for_changes(ClientState()), allow_nan=False)) == {
+        "history": {"anew": True, "events": []}
+    }
+
+
+def test_an_event_that_cannot_be_shown_is_refused(board):
+    history = KeyframeHistory(board)
+    for message in (
+        replace(head(0, 5), sequence=-1),
+        head(0, 10**400),
+        replace(head(0, 5), path_length=float("nan")),
+        Hypotheses(0, (Hypothesis(3, 0, float("inf"), 5),)),
+        Hypotheses(10**30, ()),
+    ):
+        with pytest.raises(HmtSlamError, match=r" = .* is none of a keyframe event: run the same version everywhere"):
+            history.add(message)
+    history.publish_complete()
+    assert board.wait_for_changes(ClientState())["history"]["events"] == []
+
+
+def test_diagnostics_of_a_stranger_stay_small_and_finite():
+    health = SystemHealth(NODES)
+    for number in range(2000):
+        health.update(f"stranger {number}", 0, "m" * 10_000, {f"{k}": "v" * 10_000 for k in range(200)}, 0.0)
+    for now, busy in ((1.0, "nan s"), (2.0, "inf s"), (3.0, "-inf s")):
+        health.update("slam", 0, "running", {"busy": busy}, now)
+        assert json.dumps(health.rows(now), allow_nan=False)
+    rows = health.rows(3.0)
+    assert len(rows) <= 102
+    assert len(json.dumps(rows)) < 20_000_000
 
 
 def well(health, now, **messages):
@@ -220,6 +260,23 @@ def test_no_pose_is_a_fault_but_not_after_the_end_of_a_log():
     assert health.verdict(5.0)["text"] == "No pose for 4 s."
     health.robot_state = "ended"
     assert health.verdict(5.0)["level"] == "good"
+
+
+def test_a_second_system_is_named_for_as_long_as_it_is_received():
+    health = SystemHealth(NODES, last_pose_at=1.0)
+    well(health, 0.0)
+    health.second_system = "two"
+    assert health.verdict(1.0) == {
+        "level": "attention",
+        "text": "A second system runs here: two.",
+        "advice": "Give each system a namespace or a ROS_DOMAIN_ID of its own.",
+    }
+    health.second_system = ""
+    health.update("rtl", 0, "running", {"second system": "2 publishers of pose"}, 1.0)
+    assert health.verdict(1.0)["text"] == "A second system runs here: 2 publishers of pose."
+    health.update("rtl", 0, "running", {}, 2.0)
+    health.last_pose_at = 2.0
+    assert health.verdict(2.0)["level"] == "good"
 
 
 def test_a_node_that_is_halted_is_named_rather_than_the_pose_that_does_not_come():

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -15,21 +13,19 @@ from nav_msgs.msg import OccupancyGrid
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Bool, Float64, String
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.geometry.gaussian import ELLIPSE_95
-from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
-from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.messages.documents import KeyframeHeader, RobotStatus, decode
+from hmt_slam_ros.messages.documents import KeyframeHeader, RobotStatus
 from hmt_slam_ros.messages.messages import Hypotheses
 from hmt_slam_ros.process_table import process_names, producer
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import area_from_frame, gaussian_from_message, pose_from_message, stamp_from_time
-from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
+from hmt_slam_ros.ros.diagnostics import SYSTEM, NodeDiagnostics
+from hmt_slam_ros.ros.guarded_node import GuardedNode
+from hmt_slam_ros.ros.message_io import document_callback
+from hmt_slam_ros.ros.parameters import declare_system
 from hmt_slam_ros.ros.topics import (
     DIAGNOSTICS,
     DOCUMENTS,
@@ -40,8 +36,16 @@ from hmt_slam_ros.ros.topics import (
     KEYFRAMES,
     MAP,
     POSE,
-    ROBOT_STATUS,
 )
+from hmt_slam_ros.ros.view_conversions import (
+    area_section,
+    finite,
+    graph_section,
+    map_cells,
+    map_section,
+    robot_section,
+)
+from hmt_slam_ros.untrusted_input import shorten
 from hmt_slam_ros.view.board import Board, KeyframeHistory
 from hmt_slam_ros.view.health import SystemHealth
 from hmt_slam_ros.view.server import LOCAL, PORT, PageServer, grid_png
@@ -63,6 +67,10 @@ _PORT = ParameterDescriptor(
     read_only=True,
     integer_range=[IntegerRange(from_value=0, to_value=65535)],
 )
+_ALLOWED_HOSTS = ParameterDescriptor(
+    description="Host names, separated by commas, under which the page is served, beside those of this computer.",
+    read_only=True,
+)
 _PUBLISHERS = {
     POSE: producer("RealTimePose"),
     HMT_POSE: producer("RealTimePose"),
@@ -77,7 +85,7 @@ _PUBLISHERS = {
 """{topic: its node} on the page."""
 
 
-class ViewNode(Node):
+class ViewNode(GuardedNode):
     """The node ``view``."""
 
     def __init__(self, name: str) -> None:
@@ -86,7 +94,7 @@ class ViewNode(Node):
         :raises HmtSlamError: for an invalid address or port.
         """
         super().__init__(name)
-        self.diagnostics = NodeDiagnostics(self)
+        self.diagnostics = NodeDiagnostics(self, declare_system(self))
         self.board = Board()
         self._health, self._history = SystemHealth(process_names()), KeyframeHistory(self.board)
         self._message_times: dict[str, float] = {}
@@ -97,33 +105,41 @@ class ViewNode(Node):
         self._server = PageServer(self.board, *self._declare_address())
         self.board.put("about", {"namespace": self.get_namespace()})
         self._subscribe(PoseWithCovarianceStamped, POSE, self._on_pose, topics.NEWEST)
-        self._subscribe(PoseWithCovarianceStamped, HMT_POSE, self._on_hmt_pose, topics.NEWEST)
-        self._subscribe(MarkerArray, GRAPH, self._on_graph, topics.LATCHED)
         self._subscribe(
-            String, KEYFRAMES, lambda m: self._history.add(decode(m.data, KeyframeHeader)), topics.CHAIN_HISTORY
+            PoseWithCovarianceStamped, HMT_POSE, lambda m: self.board.put("area", area_section(m)), topics.NEWEST
         )
-        topic = DOCUMENTS[Hypotheses]
-        self._subscribe(String, topic, lambda m: self._history.add(decode(m.data, Hypotheses)), topics.CHAIN_HISTORY)
+        self._subscribe(MarkerArray, GRAPH, self._on_graph, topics.LATCHED)
+        for kind in (KeyframeHeader, Hypotheses):
+            self._subscribe(
+                String,
+                DOCUMENTS[kind],
+                document_callback(self.diagnostics, kind, self._history.add),
+                topics.CHAIN_HISTORY,
+            )
         self._subscribe(Bool, IS_LOCALIZED, self._on_localized, topics.LATCHED)
-        self._subscribe(Float64, ENTROPY, lambda m: self.board.put("entropy", round(m.data, 3)), topics.LATCHED)
-        self._subscribe(String, ROBOT_STATUS, self._on_robot_status, topics.LATCHED)
+        self._subscribe(
+            Float64, ENTROPY, lambda m: self.board.put("entropy", round(finite(m.data, "entropy"), 3)), topics.LATCHED
+        )
+        on_status = document_callback(self.diagnostics, RobotStatus, self._on_robot_status, may_be_unnamed=True)
+        self._subscribe(String, DOCUMENTS[RobotStatus], on_status, topics.LATCHED)
         self._subscribe(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, topics.STREAM)
         self._publish_health()
         self.get_logger().info(f"the page is at {self._server.url}")
 
-    def _declare_address(self) -> tuple[str, int]:
-        """Declare ``address`` and ``port``, and return them.
+    def _declare_address(self) -> tuple[str, int, list[str]]:
+        """Declare ``address``, ``port`` and ``allowed_hosts``, and return them.
 
         :raises HmtSlamError: for invalid ones.
         """
         try:
             address = self.declare_parameter("address", LOCAL, _ADDRESS).value
             port = self.declare_parameter("port", PORT, _PORT).value
+            allowed_hosts = self.declare_parameter("allowed_hosts", "", _ALLOWED_HOSTS).value
         except (InvalidParameterTypeException, InvalidParameterValueException) as fault:
             raise HmtSlamError(
                 f"address or port of the page is none ({fault}): give such as -p address:={LOCAL} -p port:={PORT}"
             ) from fault
-        return str(address), int(port)
+        return str(address), int(port), str(allowed_hosts).split(",")
 
     def _subscribe(self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile) -> Any:  # noqa: ANN401
         """Subscribe, and count messages; return rclpy's subscription."""
@@ -132,10 +148,7 @@ class ViewNode(Node):
             self._message_count += 1
             self._message_times[topic] = self._listening_time
             self.diagnostics.received[topic] += 1
-            try:
-                callback(message)
-            except HmtSlamError as fault:
-                self.diagnostics.warn(f"{topic}: {fault}")
+            callback(message)
 
         return self.create_subscription(kind, topic, counting_callback, profile)
 
@@ -175,6 +188,7 @@ class ViewNode(Node):
 
     def _publish_health(self) -> None:
         now = self._listening_time
+        self._health.second_system = self.diagnostics.system.other
         self.board.put("verdict", self._health.verdict(now))
         self.board.put("nodes", self._health.rows(now))
         times = self._message_times
@@ -183,81 +197,36 @@ class ViewNode(Node):
         self.board.put("topics", [{"topic": t, "from": _PUBLISHERS[t], "age": age} for t, age in ages.items()])
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        self.board.put("robot", robot_section(message))
         self._health.last_pose_at = self._listening_time
-        belief = gaussian_from_message(message.pose)
-        ellipse, (x, y, theta) = belief.position_ellipse(), belief.mean.tolist()
-        pose = {
-            "time": round(stamp_from_time(message.header.stamp) / NANOSECONDS, 3),
-            "pose": [round(x, 3), round(y, 3), round(theta, 4)],
-            "ellipse": None if is_uninformative(belief) else [round(value, 4) for value in ellipse],
-            "deviation": round(ellipse.semi_major / ELLIPSE_95, 3),
-            "turn": round(math.degrees(math.sqrt(max(0.0, belief.covariance[2, 2]))), 2),
-        }
-        self.board.put("robot", pose)
-
-    def _on_hmt_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self.board.put("area", str(area_from_frame(message.header.frame_id)))
 
     def _on_graph(self, message: MarkerArray) -> None:
-        groups: dict[str, dict[int, Marker]] = {}
-        for marker in message.markers:
-            groups.setdefault(marker.ns, {})[marker.id] = marker
-        area_ellipses, arc_ellipses = groups.get("area_uncertainty", {}), groups.get("arc_uncertainty", {})
-        areas = [
-            {"area": number, "at": _xy(disc.pose.position), **_uncertainty(area_ellipses.get(number))}
-            for number, disc in groups.get("areas", {}).items()
-        ]
-        arcs = [
-            {
-                "closure": group == "closures",
-                "ends": [_xy(p) for p in line.points],
-                **_uncertainty(arc_ellipses.get(number)),
-            }
-            for group in ("arcs", "closures")
-            for number, line in groups.get(group, {}).items()
-        ]
-        self.board.put("graph", {"areas": areas, "arcs": arcs})
+        self.board.put("graph", graph_section(message))
 
     def _on_localized(self, message: Bool) -> None:
         self._health.is_localized = message.data
         self.board.put("localized", message.data)
 
-    def _on_robot_status(self, message: String) -> None:
-        status = decode(message.data, RobotStatus)
+    def _on_robot_status(self, status: RobotStatus) -> None:
         self._health.robot_state = status.state
-        progress = {"state": status.state, "log": status.log, "done": status.acknowledged, "scans": status.scans_in_log}
+        log = shorten(status.log)
+        progress = {"state": status.state, "log": log, "done": status.acknowledged, "scans": status.scans_in_log}
         self.board.put("replay", progress)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.hardware_id == "hmt_slam_ros":
                 values = {entry.key: entry.value for entry in status.values}
+                if SYSTEM in values:  # a node that has received no document yet has none
+                    self.diagnostics.system.admit(values[SYSTEM])
                 name, level = status.name.rsplit("/", 1)[-1], int.from_bytes(status.level, "little")
                 self._health.update(name, level, status.message, values, self._listening_time)
 
     def _on_map(self, message: OccupancyGrid) -> None:
-        info = message.info
-        cells = np.frombuffer(message.data, dtype=np.int8)
-        if cells.size != info.height * info.width:
-            raise HmtSlamError(f"a map of {info.width} x {info.height} cells has {cells.size}: look who publishes it")
-        origin = pose_from_message(info.origin)
-        tag = self.board.put_map_image(grid_png(cells.reshape(info.height, info.width)))
-        size = [round(info.width * info.resolution, 3), round(info.height * info.resolution, 3)]
-        self.board.put("map", {"tag": tag, "origin": origin[:2].tolist(), "size": size})
+        section, cells = map_section(message), map_cells(message)
+        self.board.put("map", {"tag": self.board.put_map_image(grid_png(cells)), **section})
 
     def destroy_node(self) -> None:
         """Stop the server, and destroy the node."""
         self._server.close()
         super().destroy_node()
-
-
-def _uncertainty(marker: Marker | None) -> dict[str, Any]:
-    """Half axes and angle of an ellipse, and its text."""
-    if marker is None:
-        return {"ellipse": None, "text": "It is not known where this is in the map."}
-    ellipse = [0.5 * marker.scale.x, 0.5 * marker.scale.y, float(pose_from_message(marker.pose)[2])]
-    return {"ellipse": [round(v, 4) for v in ellipse], "text": marker.text}
-
-
-def _xy(point: Any) -> list[float]:  # noqa: ANN401  a ROS point
-    return [round(point.x, 3), round(point.y, 3)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import threading
 import time
 from collections import deque
@@ -11,8 +12,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.documents import KeyframeHeader
 from hmt_slam_ros.messages.messages import Hypotheses
+from hmt_slam_ros.sensors.plausibility import MAX_STAMP
+from hmt_slam_ros.untrusted_input import shorten
 
 _MAX_BARS = 12
 """Hypotheses of an event that the page shows. It adds the others, the least probable, to the unexamined probability."""
@@ -34,7 +38,11 @@ class KeyframeHistory:
         self._published_stamps: dict[int, int] = {}
 
     def add(self, message: KeyframeHeader | Hypotheses) -> None:
-        """Store a message until its counterpart arrives."""
+        """Store a message until its counterpart arrives.
+
+        :raises HmtSlamError: where a number in it is none that the page can show.
+        """
+        _check_event(message)
         pending: dict[int, Any] = self._headers if isinstance(message, KeyframeHeader) else self._answers
         pending[message.sequence] = message
         while len(pending) > HISTORY_LENGTH:
@@ -58,6 +66,19 @@ class KeyframeHistory:
             self._board.append_event(_event_entry(header, answer))
 
 
+def _check_event(message: KeyframeHeader | Hypotheses) -> None:
+    if isinstance(message, KeyframeHeader):
+        numbers = {"stamp": message.scan.stamp, "path_length": message.path_length}
+    else:
+        numbers = {f"probability of {shorten(h.id)}": h.probability for h in message.hypotheses}
+    for name, value in {"sequence": message.sequence, **numbers}.items():
+        # An integer of any size compares with a float; it may not become one.
+        if not 0 <= value <= MAX_STAMP:
+            raise HmtSlamError(
+                f"{name} = {shorten(value)} is none of a keyframe event: run the same version everywhere"
+            )
+
+
 def _event_entry(header: KeyframeHeader, answer: Hypotheses) -> dict[str, Any]:
     """Time, s, path length, m, and (hypothesis, area, probability, lost) of each, the most probable first."""
     hypotheses = sorted(answer.hypotheses, key=lambda hypothesis: (-hypothesis.probability, hypothesis.id))[:_MAX_BARS]
@@ -68,6 +89,15 @@ def _event_entry(header: KeyframeHeader, answer: Hypotheses) -> dict[str, Any]:
         "hypotheses": [[h.id, h.area, round(h.probability, 5), h.lost] for h in hypotheses],
         "live": len(answer.hypotheses),
     }
+
+
+def _check_json(content: object, section: str) -> None:
+    try:
+        json.dumps(content, allow_nan=False)
+    except ValueError as fault:
+        raise HmtSlamError(
+            f"{section} of the page is no JSON ({fault}): it is not shown, look who publishes it"
+        ) from fault
 
 
 @dataclass
@@ -97,7 +127,11 @@ class Board:
         self._map_image, self._map_tag = b"", ""
 
     def put(self, section: str, content: Any) -> None:  # noqa: ANN401  any JSON value
-        """Replace a section, unless it is equal."""
+        """Replace a section, unless it is equal.
+
+        :raises HmtSlamError: where a number in it is not finite, which JSON does not have.
+        """
+        _check_json(content, section)
         with self._condition:
             known = self._sections.get(section)
             if known is None or known[1] != content:
@@ -106,7 +140,11 @@ class Board:
                 self._condition.notify_all()
 
     def append_event(self, event: Any) -> None:  # noqa: ANN401  any JSON value
-        """Append an event to the history."""
+        """Append an event to the history.
+
+        :raises HmtSlamError: as :meth:`put`.
+        """
+        _check_json(event, "history")
         with self._condition:
             self._history.append(event)
             self._event_count += 1

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any, Literal
+
+from hmt_slam_ros.messages.system_name import REMEDY
 
 Level = Literal["good", "waiting", "attention", "fault"]
 
@@ -14,11 +18,23 @@ _NODE_TIMEOUT = 10.0
 _POSE_TIMEOUT = 3.0
 """Time without a pose that is a fault, s."""
 
+_MAX_NODES = 100
+"""Nodes that the page shows; diagnostics of further ones are left out."""
+
+_MAX_VALUES = 100
+"""Values of a node that the page shows."""
+
+_MAX_TEXT = 1000
+"""Characters of a message or value that the page shows."""
+
 _WARNING_LIFETIME = 60.0
 """Time for which the page shows a warning, s: the level of a node never falls."""
 
 _WARN = 1
 """Level of a warning in diagnostic_msgs/DiagnosticStatus."""
+
+_SECOND_SYSTEM = "second system"
+"""Name of the value by which a node reports another system on its topics."""
 
 _ACTIVE = "active"
 """Lifecycle state of a node that processes messages."""
@@ -56,6 +72,7 @@ class SystemHealth:
     :ivar last_pose_at: time of the last pose, s, None before the first.
     :ivar is_localized: whether the robot is localized, None before the first status.
     :ivar robot_state: state of the node that replays a log, None where there is none.
+    :ivar second_system: name of another system that speaks on the same topics, empty without.
     """
 
     expected_nodes: Sequence[str]
@@ -63,18 +80,23 @@ class SystemHealth:
     last_pose_at: float | None = None
     is_localized: bool | None = None
     robot_state: str | None = None
+    second_system: str = ""
 
     def update(self, node: str, level: int, message: str, values: Mapping[str, str], now: float) -> None:
-        """Store the diagnostics of a node.
+        """Store the diagnostics of a node, as far as the page shows them.
 
         :param now: time on a monotonic clock, s.
         """
-        previous, load, changed = self.nodes.get(node), None, now
+        name, message = node[:_MAX_TEXT], message[:_MAX_TEXT]
+        if name not in self.nodes and name not in self.expected_nodes and len(self.nodes) >= _MAX_NODES:
+            return
+        values = {key[:_MAX_TEXT]: value[:_MAX_TEXT] for key, value in islice(values.items(), _MAX_VALUES)}
+        previous, load, changed = self.nodes.get(name), None, now
         if previous is not None and now > previous.heard_at:
             load = max(0.0, _busy_seconds(values) - _busy_seconds(previous.values)) / (now - previous.heard_at)
         if previous is not None and previous.message == message:
             changed = previous.changed_at
-        self.nodes[node] = NodeHealth(level, message, values, now, changed, load)
+        self.nodes[name] = NodeHealth(level, message, values, now, changed, load)
 
     def rows(self, now: float) -> list[dict[str, Any]]:
         """A row of the page for every node, the expected ones first."""
@@ -101,6 +123,7 @@ class SystemHealth:
             diagnostics.get("fault"),
             self._inactive_nodes_verdict(),
             self._pose_verdict(now),
+            self._second_system_verdict(),
             diagnostics.get("attention"),
         ):
             if verdict is not None:
@@ -153,6 +176,13 @@ class SystemHealth:
             if level in verbs
         }
 
+    def _second_system_verdict(self) -> dict[str, str] | None:
+        reports = (node.values[_SECOND_SYSTEM] for node in self.nodes.values() if _SECOND_SYSTEM in node.values)
+        other = self.second_system or next(reports, "")
+        if not other:
+            return None
+        return _verdict("attention", f"A second system runs here: {other}.", f"{REMEDY[0].upper()}{REMEDY[1:]}.")
+
     def _pose_verdict(self, now: float) -> dict[str, str] | None:
         if self.robot_state in ("ended", "paused"):
             return None
@@ -188,6 +218,7 @@ def _join_names(names: Sequence[str]) -> str:
 def _busy_seconds(values: Mapping[str, str]) -> float:
     """Computing time since the start, s."""
     try:
-        return float(values.get("busy", "0").removesuffix(" s"))
+        seconds = float(values.get("busy", "0").removesuffix(" s"))
     except ValueError:
         return 0.0
+    return seconds if math.isfinite(seconds) else 0.0

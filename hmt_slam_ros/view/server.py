@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 import ipaddress
 import json
+import socket
 import threading
 import time
+from collections.abc import Iterable
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ from PIL import Image
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.view.board import Board, ClientState
+from hmt_slam_ros.view.connections import IDLE_TIME, BoundedServer, Streams
+from hmt_slam_ros.view.host_check import HostCheck
 
 _UNKNOWN, _FREE, _OCCUPIED = 0, 85, 255
 """Gray levels of the map's picture, which the page replaces by its colors."""
@@ -39,20 +42,40 @@ _FILES = {
 }
 """{path of a request: (file, content type)}."""
 
-_LOOPBACK = ("localhost", "127.0.0.1", "::1")
-"""Host names under which a page that listens on the loopback interface is served."""
-
 _PERIOD = 0.2
 """Least time between two events of a stream, s."""
 
 _HEARTBEAT = 5.0
 """Longest time without a line on a stream, s: a closed connection shows only when something is written to it."""
 
+_LOOK = 0.5
+"""Longest time until a stream notices that it was closed to make room, s."""
+
 _MAX_STREAMS = 20
 """Streams that are served at once."""
 
-_SECURITY = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'"
-"""Content security policy: the page loads nothing from elsewhere."""
+_STREAM_BUFFER = 131_072
+"""Bytes that the operating system keeps of a stream that is not read."""
+
+_MAX_HEADER = 16_384
+"""Bytes of a request; browsers send about 1000."""
+
+_SECURITY_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Frame-Options": "DENY",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+}
+"""Of every answer: the page loads nothing from elsewhere, and no page of another site shows it or a part of it."""
+
+_LEVELS = np.select(
+    [np.arange(256).astype(np.int8) >= _OCCUPIED_FROM, np.arange(256).astype(np.int8) >= 0],
+    [_OCCUPIED, _FREE],
+    _UNKNOWN,
+).astype(np.uint8)
+"""Gray level of each byte of an occupancy grid."""
 
 
 def grid_png(cells: NDArray[np.int8]) -> bytes:
@@ -60,9 +83,8 @@ def grid_png(cells: NDArray[np.int8]) -> bytes:
 
     :param cells: shape (height, width), -1 unknown, else 0 to 100; row 0 is the smallest y, and the picture's lowest.
     """
-    levels = np.select([cells >= _OCCUPIED_FROM, cells >= 0], [_OCCUPIED, _FREE], _UNKNOWN).astype(np.uint8)
     file = io.BytesIO()
-    Image.fromarray(levels[::-1]).save(file, "PNG")
+    Image.fromarray(_LEVELS[cells[::-1].view(np.uint8)]).save(file, "PNG")
     return file.getvalue()
 
 
@@ -72,27 +94,34 @@ class PageServer:
     :ivar url: of the page.
     """
 
-    def __init__(self, board: Board, address: str, port: int) -> None:
+    def __init__(self, board: Board, address: str, port: int, allowed_hosts: Iterable[str] = ()) -> None:
         """Start to listen.
 
         :param address: IP address of the interface to listen on.
         :param port: TCP port, 0 for any free one.
+        :param allowed_hosts: host names under which the page is served, beside those of this computer.
         :raises HmtSlamError: where the address is invalid or the port is taken.
         """
         try:
-            local = ipaddress.ip_address(address).is_loopback
+            version = ipaddress.ip_address(address).version
         except ValueError:
             raise HmtSlamError(f"address = {address} is no IP address: give 127.0.0.1, or 0.0.0.0 for all") from None
-        attributes = {"board": board, "local": local, "streams": threading.Semaphore(_MAX_STREAMS)}
+        attributes = {"board": board, "hosts": HostCheck(allowed_hosts), "streams": Streams(_MAX_STREAMS)}
         handler = type("_BoardHandler", (_Handler,), attributes)
         self._server = _bind_server(address, port, handler)
-        self.url = f"http://{address}:{self._server.server_address[1]}/"
+        self.url = f"http://{f'[{address}]' if version == 6 else address}:{self._server.server_port}/"
         threading.Thread(target=self._server.serve_forever, name="page", daemon=True).start()
 
+    @property
+    def connection_count(self) -> int:
+        """Number of open connections."""
+        return len(self._server.connections)
+
     def close(self) -> None:
-        """Stop listening."""
+        """Stop listening, and close all connections."""
         self._server.shutdown()
         self._server.server_close()
+        self._server.connections.close_all()
 
 
 def check_port(port: int) -> None:
@@ -103,9 +132,9 @@ def check_port(port: int) -> None:
     _bind_server(LOCAL, port, _Handler).server_close()
 
 
-def _bind_server(address: str, port: int, handler: type[BaseHTTPRequestHandler]) -> _Server:
+def _bind_server(address: str, port: int, handler: type[_Handler]) -> BoundedServer:
     try:
-        return _Server((address, port), handler)
+        return BoundedServer((address, port), handler)
     except (OSError, OverflowError) as fault:
         raise HmtSlamError(
             f"the page cannot listen on {address}, port {port} ({fault}): end the program that does, or give another "
@@ -113,28 +142,63 @@ def _bind_server(address: str, port: int, handler: type[BaseHTTPRequestHandler])
         ) from fault
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    # After a restart, several pages connect at once.
-    request_queue_size = 64
-    block_on_close = False
+class _RequestReader:
+    """The lines of requests, of a bounded number of bytes for each request."""
 
-    def handle_error(self, _request: object, _client_address: object) -> None:
-        """Ignore a browser that closed its connection during an answer."""
+    def __init__(self, file: io.BufferedIOBase) -> None:
+        self._file, self._left = file, _MAX_HEADER
+
+    def begin_request(self) -> None:
+        """Allow the bytes of one more request."""
+        self._left = _MAX_HEADER
+
+    def readline(self, _limit: int = -1) -> bytes:
+        """The next line.
+
+        :raises OSError: where the request is too long.
+        """
+        line = self._file.readline(self._left)
+        self._left -= len(line)
+        if not self._left:
+            raise OSError(f"a request of more than {_MAX_HEADER} bytes")
+        return line
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
+    server_version, sys_version = "hmt_slam_view", ""
+    timeout = IDLE_TIME
     board: Board
-    local: bool
-    streams: threading.Semaphore
+    hosts: HostCheck
+    streams: Streams
+
+    def setup(self) -> None:
+        """Bound what is read."""
+        super().setup()
+        self._reader = _RequestReader(self.rfile)
+        self.rfile = self._reader  # type: ignore[assignment]
+
+    def handle_one_request(self) -> None:
+        """Wait for a request, and answer it."""
+        self._reader.begin_request()
+        self._mark(is_idle=True)
+        super().handle_one_request()
+
+    def _mark(self, *, is_idle: bool) -> None:
+        assert isinstance(self.server, BoundedServer)
+        self.server.connections.mark(self.connection, is_idle=is_idle)
 
     def do_GET(self) -> None:
         """Answer a browser."""
-        path = urlsplit(self.path).path
-        if self.local and urlsplit(f"//{self.headers.get('Host', '')}").hostname not in _LOOPBACK:
-            # DNS rebinding: a page of another site whose name resolves to this computer.
-            self._answer(HTTPStatus.FORBIDDEN, "text/plain", b"ask for 127.0.0.1 or localhost")
+        self._mark(is_idle=False)
+        path = self.path.partition("?")[0]
+        objection = self.hosts.objection(self.headers, self.connection.getsockname()[0])
+        if objection:
+            self._answer(HTTPStatus.FORBIDDEN, "text/plain", objection.encode())
         elif path in _FILES:
             name, kind = _FILES[path]
             self._answer(HTTPStatus.OK, kind, (PAGE / name).read_bytes())
@@ -158,26 +222,40 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.OK, "image/png", picture, tag)
 
     def _stream(self) -> None:
-        """Send server-sent events: JSON objects of the sections that changed, at most five a second."""
-        if not self.streams.acquire(blocking=False):
-            self._answer(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", b"too many pages look on: close some")
-            return
+        """Send server-sent events: JSON objects of the sections that changed, at most five a second.
+
+        A browser that does not read what was written within :data:`IDLE_TIME` is dropped.
+        """
+        self.close_connection = True
+        self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _STREAM_BUFFER)
+        self.streams.add(self.connection)
         try:
             self._send_header(HTTPStatus.OK, "text/event-stream")
             self.send_header("Connection", "close")
             self.end_headers()
             client = ClientState()
             with self.board.count_watcher():
-                while True:
-                    changes = self.board.wait_for_changes(client, _HEARTBEAT)
-                    text = f"data: {json.dumps(changes, allow_nan=False, separators=(',', ':'))}" if changes else ":"
-                    self.wfile.write(f"{text}\n\n".encode())
-                    self.wfile.flush()
-                    time.sleep(_PERIOD)
-        except OSError:
-            self.close_connection = True
+                self._send_events(client)
         finally:
-            self.streams.release()
+            self.streams.remove(self.connection)
+
+    def _send_events(self, client: ClientState) -> None:
+        """Send events until the stream is closed to make room, or by the browser.
+
+        :raises OSError: where the browser closed it, or does not read.
+        """
+        last = time.monotonic()
+        while self.connection in self.streams:
+            changes = self.board.wait_for_changes(client, _LOOK)
+            if changes:
+                text = f"data: {json.dumps(changes, allow_nan=False, separators=(',', ':'))}"
+            elif time.monotonic() - last >= _HEARTBEAT:
+                text = ":"
+            else:
+                continue
+            last = time.monotonic()
+            self.wfile.write(f"{text}\n\n".encode())
+            time.sleep(_PERIOD)
 
     def _answer(self, status: HTTPStatus, kind: str, content: bytes, tag: str = "") -> None:
         self._send_header(status, kind)
@@ -192,8 +270,12 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Cache-Control", "no-cache")
-        self.send_header("Content-Security-Policy", _SECURITY)
-        self.send_header("X-Content-Type-Options", "nosniff")
+
+    def end_headers(self) -> None:
+        """Add the headers of every answer, that of an error too."""
+        for name, value in _SECURITY_HEADERS.items():
+            self.send_header(name, value)
+        super().end_headers()
 
     def log_message(self, *_: object) -> None:
         """Log no requests."""

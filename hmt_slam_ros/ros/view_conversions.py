@@ -1,0 +1,159 @@
+"""Sections of the live page from ROS messages: what a page cannot show is refused, whoever sent it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid
+from numpy.typing import NDArray
+from visualization_msgs.msg import Marker, MarkerArray
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry.gaussian import ELLIPSE_95
+from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
+from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.ros.conversions import area_from_frame, gaussian_from_message, pose_from_message, stamp_from_time
+from hmt_slam_ros.sensors.plausibility import MAX_COORDINATE, check_quaternion
+
+_MAX_CELLS = 64_000_000
+"""Of a map: 400 m by 400 m in cells of 5 cm; its picture takes about a second."""
+_MAX_MARKERS = 20_000
+"""Of a graph; five for an area and its arc."""
+_MAX_LINE_POINTS = 16
+"""Of an arc, which has two."""
+_MAX_TEXT = 500
+"""Characters of a marker that the page shows."""
+_MAX_FRAME = 40
+"""Characters of an area's frame."""
+_MAX_VARIANCE = 1e14
+"""m^2 or rad^2 of a pose; the robot may be anywhere with 1e8."""
+
+
+def finite(value: float, name: str, reach: float = math.inf) -> float:
+    """A number, where it is one.
+
+    :param reach: its largest magnitude.
+    :raises HmtSlamError: where it is not finite or beyond.
+    """
+    if not (math.isfinite(value) and abs(value) <= reach):
+        raise HmtSlamError(f"{name} = {value} cannot be shown on the page: look who publishes it")
+    return value
+
+
+def robot_section(message: PoseWithCovarianceStamped) -> dict[str, Any]:
+    """Pose of the robot in the map, m and rad, its 95 % ellipse, and standard deviations, m and degrees.
+
+    :raises HmtSlamError: where a number is not finite, or the orientation is no rotation.
+    """
+    _check_pose(message.pose.pose)
+    _check_all(message.pose.covariance, "covariance", _MAX_VARIANCE)
+    belief = gaussian_from_message(message.pose)
+    ellipse, (x, y, theta) = belief.position_ellipse(), belief.mean.tolist()
+    return {
+        "time": round(stamp_from_time(message.header.stamp) / NANOSECONDS, 3),
+        "pose": [round(x, 3), round(y, 3), round(theta, 4)],
+        "ellipse": None if is_uninformative(belief) else [round(value, 4) for value in ellipse],
+        "deviation": round(ellipse.semi_major / ELLIPSE_95, 3),
+        "turn": round(math.degrees(math.sqrt(max(0.0, belief.covariance[2, 2]))), 2),
+    }
+
+
+def area_section(message: PoseWithCovarianceStamped) -> str:
+    """Number of the area that the robot is in.
+
+    :raises HmtSlamError: where the frame is none of an area.
+    """
+    frame = message.header.frame_id
+    if len(frame) > _MAX_FRAME or not frame.isascii():
+        raise HmtSlamError(f"a frame of {len(frame)} characters is none of an area: run the same version everywhere")
+    return str(area_from_frame(frame))
+
+
+def graph_section(message: MarkerArray) -> dict[str, Any]:
+    """Areas and arcs of the map with their ellipses, m and rad in the map.
+
+    :raises HmtSlamError: where a number is not finite, or there are too many markers or points.
+    """
+    if len(message.markers) > _MAX_MARKERS:
+        raise HmtSlamError(f"a graph has {len(message.markers)} markers, more than {_MAX_MARKERS}: it is not shown")
+    groups: dict[str, dict[int, Marker]] = {}
+    for marker in message.markers:
+        groups.setdefault(marker.ns, {})[marker.id] = marker
+    area_ellipses, arc_ellipses = groups.get("area_uncertainty", {}), groups.get("arc_uncertainty", {})
+    areas = [
+        {"area": number, "at": _xy(disc.pose.position), **_uncertainty(area_ellipses.get(number))}
+        for number, disc in groups.get("areas", {}).items()
+    ]
+    arcs = [
+        {"closure": group == "closures", "ends": _ends(line), **_uncertainty(arc_ellipses.get(number))}
+        for group in ("arcs", "closures")
+        for number, line in groups.get(group, {}).items()
+    ]
+    return {"areas": areas, "arcs": arcs}
+
+
+def map_cells(message: OccupancyGrid) -> NDArray[np.int8]:
+    """Cells of a map, shape (height, width), row 0 with the smallest y.
+
+    :raises HmtSlamError: where there are none, too many, or not as many as its size says.
+    """
+    width, height, count = message.info.width, message.info.height, len(message.data)
+    if count != width * height:
+        raise HmtSlamError(f"a map of {width} x {height} cells has {count}: look who publishes it")
+    if not 0 < count <= _MAX_CELLS:
+        raise HmtSlamError(
+            f"a map of {width} x {height} cells is empty or too large to be shown: look who publishes it"
+        )
+    return np.frombuffer(message.data, dtype=np.int8).reshape(height, width)
+
+
+def map_section(message: OccupancyGrid) -> dict[str, Any]:
+    """Lower left corner and size of a map, m.
+
+    :raises HmtSlamError: where a number is not finite or the resolution is not positive.
+    """
+    info = message.info
+    resolution = finite(info.resolution, "resolution", MAX_COORDINATE)
+    if resolution <= 0.0:
+        raise HmtSlamError(f"resolution = {resolution} m is none of a map: look who publishes it")
+    _check_pose(info.origin)
+    origin = pose_from_message(info.origin)
+    return {
+        "origin": origin[:2].tolist(),
+        "size": [round(info.width * resolution, 3), round(info.height * resolution, 3)],
+    }
+
+
+def _check_pose(pose: Pose) -> None:
+    _check_all((pose.position.x, pose.position.y), "position", MAX_COORDINATE)
+    q = pose.orientation
+    check_quaternion((q.x, q.y, q.z, q.w))
+
+
+def _check_all(values: Iterable[float], name: str, reach: float) -> None:
+    for value in values:
+        finite(float(value), name, reach)
+
+
+def _ends(line: Marker) -> list[list[float]]:
+    if len(line.points) > _MAX_LINE_POINTS:
+        raise HmtSlamError(f"an arc has {len(line.points)} points instead of 2: look who publishes it")
+    return [_xy(point) for point in line.points]
+
+
+def _uncertainty(marker: Marker | None) -> dict[str, Any]:
+    """Half axes and angle of an ellipse, and its text."""
+    if marker is None:
+        return {"ellipse": None, "text": "It is not known where this is in the map."}
+    _check_pose(marker.pose)
+    _check_all((marker.scale.x, marker.scale.y), "scale", MAX_COORDINATE)
+    ellipse = [0.5 * marker.scale.x, 0.5 * marker.scale.y, float(pose_from_message(marker.pose)[2])]
+    return {"ellipse": [round(v, 4) for v in ellipse], "text": marker.text[:_MAX_TEXT]}
+
+
+def _xy(point: Any) -> list[float]:  # noqa: ANN401  a ROS point
+    return [round(finite(value, "position", MAX_COORDINATE), 3) for value in (point.x, point.y)]
