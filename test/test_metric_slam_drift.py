@@ -10,7 +10,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import MovedKeyframe
 from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis
-from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
+from hmt_slam_ros.sensors.motion_model import Prediction
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.particle_filter import ParticleFilter, ParticleFilters

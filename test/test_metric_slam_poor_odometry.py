@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_metric_slam import WALLS, Dialogue
 from test_submap_scan_matcher import with_niches
-from worlds import scan_in
+from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.messages import EndOfLog, LocalEstimate, Notice
@@ -54,6 +54,20 @@ def test_a_slip_in_a_turn_does_not_lose_the_robot_and_is_reported_once(rate, sli
     assert by_odometry - by_scans == pytest.approx(slip, abs=6.0)
     begin, end = map(float, re.search(r"from ([\d.]+) s to ([\d.]+) s", notice.text).groups())
     assert 8.0 <= begin < end <= 9.5
+
+
+def test_in_a_bare_corridor_odometry_that_repeats_and_catches_up_is_taken_as_steady_motion():
+    corridor = box(-100.0, -1.2, 100.0, 1.2)
+    dialogue, truths = Dialogue(), []
+    for k in range(60):
+        pose, stamp = np.array([0.16 * k, 0.0, 0.0]), SECOND + k * SECOND // 5
+        shown = truths[30] if 30 < k <= 35 else pose
+        dialogue.send(Odometry(stamp, shown), scan_in(corridor, pose, stamp=stamp, noise=0.01, seed=k))
+        truths.append(pose)
+    dialogue.send(EndOfLog())
+    assert errors(dialogue, truths)[0] < 0.1
+    (notice,) = (notice for notice in dialogue.messages_of(Notice) if "fell behind the robot" in notice.text)
+    assert "for 1.00 s at 7.2" in notice.text
 
 
 @pytest.mark.parametrize("rate", [1.0, 2.0, 5.0, 10.0])

@@ -51,6 +51,14 @@ def test_no_more_scans_are_under_way_than_the_window_holds():
     assert player.scans_sent == 5
 
 
+def test_as_many_scans_are_under_way_as_slam_may_wait_for():
+    player = Player(Corridor(30), RobotParameters(rate=0.0, max_unacknowledged_scans=3), patience=1.0)
+    scans = [measurement for _, measurement in play(player, 1.0, acknowledge=False) if isinstance(measurement, Scan)]
+    assert len(scans) > 3
+    assert player.is_held_up
+    assert 0.8 < (scans[-1].stamp - scans[0].stamp) * 1e-9 <= 1.0
+
+
 def test_without_pace_nothing_is_held_back():
     player = Player(Corridor(9), RobotParameters(rate=0.0, flow_control=False, max_unacknowledged_scans=1))
     play(player, 1.0, acknowledge=False)

@@ -36,6 +36,9 @@ class MotionParameters:
     fault_probability: float = parameter(
         0.01, "Probability that the odometry of a scan is wrong beyond its deviations.", 1e-9, 0.5
     )
+    patience: float = parameter(
+        3.0, "Time for which a scan waits for later odometry, where its own stops or jumps.", 0.0, 30.0, "s"
+    )
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.messages import Message, Notice
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.motion_model import NO_MOTION, NOISY_FACTOR, OdometryNoise, RelativeMotion
+from hmt_slam_ros.sensors.motion_model import NOISY_FACTOR, OdometryNoise
 from hmt_slam_ros.sensors.odometry import OdometryBuffer
+from hmt_slam_ros.sensors.relative_motion import NO_MOTION, RelativeMotion
 from hmt_slam_ros.sensors.scan import SweepCheck, SweepState
 from hmt_slam_ros.submap.local_filter import TrackedMotion
 
@@ -120,6 +121,11 @@ class ScanQueue:
             ended or not self._state.waits_for_odometry or self._odometry.covers(self._scans[0].end_stamp)
         )
 
+    @property
+    def next_scan(self) -> Scan:
+        """The next scan, which stays in the queue."""
+        return self._scans[0]
+
     def pop(self) -> Scan:
         """The next scan."""
         return self._scans.popleft()
@@ -197,6 +203,8 @@ class OdometryMonitorState:
     :ivar last_notice: end of the last disagreement that was reported, s, None before the first.
     :ivar unreported: number of disagreements since then that were not reported.
     :ivar noise_reported: whether noisy odometry was reported.
+    :ivar last_stale_notice: stamp of the scan at which stale odometry was last reported, s, None before the first.
+    :ivar unreported_stale: number of times since then that were not reported.
     """
 
     last_stamp: int = 0
@@ -204,6 +212,8 @@ class OdometryMonitorState:
     last_notice: float | None = None
     unreported: int = 0
     noise_reported: bool = False
+    last_stale_notice: float | None = None
+    unreported_stale: int = 0
 
 
 class OdometryMonitor:
@@ -243,12 +253,27 @@ class OdometryMonitor:
         if last is not None and episode.end * _SECOND - last < _PAUSE:
             self.state = replace(self.state, unreported=unreported + 1)
             return None
-        since = f" ({unreported} times more since the last notice)" if unreported else ""
         self.state = replace(self.state, last_notice=episode.end * _SECOND, unreported=0)
         return (
             f"odometry {_motion_text(episode.odometry_motion)} from {episode.begin * _SECOND:.3f} s to "
-            f"{episode.end * _SECOND:.3f} s, where the scans say that it {_motion_text(episode.scan_motion)}{since}: "
-            "the scans are believed; look for slipping wheels and late stamps."
+            f"{episode.end * _SECOND:.3f} s, where the scans say that it {_motion_text(episode.scan_motion)}"
+            f"{_since_text(unreported)}: the scans are believed; look for slipping wheels and late stamps."
+        )
+
+    def add_stale_odometry(self, stamp: int, seconds: float) -> str | None:
+        """The notice of odometry that fell behind the robot, if the last one is old.
+
+        :param stamp: of the first scan concerned, ns.
+        :param seconds: for which it fell behind.
+        """
+        now, last, unreported = stamp * _SECOND, self.state.last_stale_notice, self.state.unreported_stale
+        if last is not None and 0.0 <= now - last < _PAUSE:
+            self.state = replace(self.state, unreported_stale=unreported + 1)
+            return None
+        self.state = replace(self.state, last_stale_notice=now, unreported_stale=0)
+        return (
+            f"odometry fell behind the robot for {seconds:.2f} s at {now:.3f} s{_since_text(unreported)}, and caught "
+            "up by a jump: that motion is taken as steady; look for a driver that repeats readings or sends them late."
         )
 
     def check_noise(self, noise: OdometryNoise) -> str | None:
@@ -262,6 +287,10 @@ class OdometryMonitor:
             "in heading as the noise model of odometry expects, so it is trusted less: raise "
             "motion.rotation_from_rotation and its neighbors if it stays so."
         )
+
+
+def _since_text(unreported: int) -> str:
+    return f" ({unreported} times more since the last notice)" if unreported else ""
 
 
 def _motion_difference(odometry: Float64, scans: Float64) -> tuple[float, float]:

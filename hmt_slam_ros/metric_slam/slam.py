@@ -239,6 +239,12 @@ class MetricSlam:
     def _process_queue(self) -> list[Message]:
         answers: list[Message] = []
         while not self._state.awaiting_decision and self._scan_queue.is_ready(ended=self._ended):
+            scan = self._scan_queue.next_scan
+            stale = self._motion.settle_odometry(scan.stamp)
+            if stale is None and not self._ended:
+                break
+            if stale:
+                answers += self._notices(self._odometry_monitor.add_stale_odometry(scan.stamp, stale))
             answers += self._process_scan(self._scan_queue.pop())
         if self._ended and not self._scan_queue and not self._state.awaiting_decision:
             answers += self._finish()

@@ -28,8 +28,13 @@ class Player:
     :ivar has_ended: whether the last measurement was given.
     """
 
-    def __init__(self, log: Log, settings: RobotParameters) -> None:
+    def __init__(self, log: Log, settings: RobotParameters, patience: float = 0.0) -> None:
+        """Start with the first measurement.
+
+        :param patience: time for which slam may wait for later odometry before it answers a scan, s.
+        """
         self.settings = settings
+        self._patience = round(patience * NANOSECONDS)
         self.is_paused = False
         self.scans_sent, self.readings_sent, self.stamp = 0, 0, 0
         self._records = _measurements(log, settings)
@@ -50,11 +55,15 @@ class Player:
 
     @property
     def is_held_up(self) -> bool:
-        """Whether the next measurement waits for an acknowledgement."""
+        """Whether the next measurement waits for an acknowledgement.
+
+        The scans under way may be more than ``max_unacknowledged_scans`` where they span less than slam's patience.
+        """
         return (
             self.settings.flow_control
             and isinstance(self._next_measurement, Scan)
             and len(self._unacknowledged) >= self.settings.max_unacknowledged_scans
+            and self._next_measurement.stamp > self._unacknowledged[0] + self._patience
         )
 
     def seconds_until_due(self, now: float) -> float | None:

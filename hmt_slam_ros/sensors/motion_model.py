@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import matrix_inverse, propagate_covariance
+from hmt_slam_ros.geometry.gaussian import matrix_inverse
 from hmt_slam_ros.sensors.odometry import Odometry, OdometryBuffer
+from hmt_slam_ros.sensors.relative_motion import NO_MOTION, RelativeMotion, increment_covariance, squared_accelerations
+from hmt_slam_ros.sensors.stale_odometry import count_steady_steps
 
 _RECENT_WEIGHT, _LONG_TERM_WEIGHT = 0.1, 0.02
 """Weight of the newest period between scans in the recent mean, and in the mean that outlasts a burst."""
@@ -35,37 +36,6 @@ _OUTLIER = 3.0
 
 NOISY_FACTOR = 2.0
 """Factor on the deviations of the odometry model from which odometry counts as noisy."""
-
-_DEGREES, _RADIANS = 180.0 / math.pi, math.pi / 180.0
-
-Length = TypeVar("Length", float, Float64)
-
-
-class RelativeMotion(NamedTuple):
-    """A motion between two scans.
-
-    :ivar increment: shape (3,), ``start_T_end``.
-    :ivar covariance: shape (3, 3), in the frame of its end.
-    """
-
-    increment: Float64
-    covariance: Float64
-
-    def compose(self, other: RelativeMotion) -> RelativeMotion:
-        """Both motions, one after the other."""
-        before = propagate_covariance(self.covariance, other.increment)
-        return RelativeMotion(se2.compose(self.increment, other.increment), before + other.covariance)
-
-    def fuse(self, other: RelativeMotion) -> RelativeMotion:
-        """The same motion from two independent sources: the product of both Gaussians."""
-        gain = self.covariance @ matrix_inverse(self.covariance + other.covariance)
-        difference = se2.log(se2.between(self.increment, other.increment))
-        increment = se2.compose(self.increment, se2.exp(gain @ difference))
-        return RelativeMotion(increment, self.covariance - gain @ self.covariance)
-
-
-NO_MOTION = RelativeMotion(np.zeros(3), np.zeros((3, 3)))
-"""No motion, without uncertainty."""
 
 
 class Prediction(NamedTuple):
@@ -114,7 +84,7 @@ class Inertia:
 
     def __init__(self, motion: MotionParameters, state: InertiaState | None = None) -> None:
         """:param state: to go on from."""
-        self._acceleration = _squared_accelerations(motion)
+        self._acceleration = squared_accelerations(motion)
         self._floor = increment_covariance(np.zeros(3), motion)
         largest = self._acceleration * _TIME_CONSTANTS**2
         self._prior_information = np.linalg.inv(largest)
@@ -122,6 +92,11 @@ class Inertia:
 
     def predict(self, seconds: float) -> RelativeMotion:
         """The motion of the next ``seconds`` since the last scan."""
+        motion, self.state = self.forecast(seconds)
+        return motion
+
+    def forecast(self, seconds: float) -> tuple[RelativeMotion, InertiaState]:
+        """The motion of the next ``seconds`` since the last scan, and the state with it."""
         state = self.state
         long_term = _moving_mean(state.long_term_period, seconds, _LONG_TERM_WEIGHT)
         is_regular = long_term / _IRREGULAR < seconds < long_term * _IRREGULAR
@@ -130,10 +105,10 @@ class Inertia:
         # Over a long time the velocity stays within what the accelerations admit.
         information = matrix_inverse(state.covariance + self._acceleration * interval**2) + self._prior_information
         covariance = matrix_inverse(information)
-        self.state = InertiaState(state.velocity, covariance, information, long_term, recent, interval, error)
+        predicted = InertiaState(state.velocity, covariance, information, long_term, recent, interval, error)
         lasting = _TIME_CONSTANTS * np.tanh(interval / _TIME_CONSTANTS)
         spread = covariance * interval**2 + np.outer(error, error) + self._floor
-        return RelativeMotion(se2.exp(state.velocity * lasting), spread)
+        return RelativeMotion(se2.exp(state.velocity * lasting), spread), predicted
 
     def observe(self, increment: Float64, information: Float64, odometry: RelativeMotion | None = None) -> None:
         """Update the velocity by the motion that was predicted last.
@@ -286,7 +261,7 @@ class MotionModel:
         self.noise = OdometryNoise(state.noise)
         self._motion = motion
         self._inertia = Inertia(motion, state.inertia)
-        self._squared_accelerations = _squared_accelerations(motion)
+        self._squared_accelerations = squared_accelerations(motion)
         # All but the three parts above, which change in place.
         self._state = replace(state, readings=(), noise=OdometryNoiseState(), inertia=None)
 
@@ -301,6 +276,32 @@ class MotionModel:
     def odometry_pose(self) -> Float64:
         """``odom_T_base`` (3,) at the last scan; where odometry is unknown, continued by the matched motion."""
         return self._state.odometry_pose
+
+    def settle_odometry(self, stamp: int) -> float | None:
+        """Remove stale readings before a scan is predicted; later readings may have to decide whether they are.
+
+        :param stamp: of the scan, ns, up to which there are readings.
+        :returns: time over which readings were stale, s, 0 for none; None as long as the decision is open.
+        """
+        last = self._state.stamp
+        if last is None or self._state.interpolation_gap is None or stamp <= last:
+            return 0.0
+        interval = stamp - last
+        seconds = interval * 1e-9
+        stamps = range(stamp, stamp + round(self._motion.patience * 1e9) + 1, interval)
+        steps = count_steady_steps(
+            self._state.odometry_pose,
+            self.odometry.poses_at(stamps),
+            self._inertia.forecast(seconds)[0],
+            self._squared_accelerations * seconds**4,
+            lambda step: self.noise.scale(RelativeMotion(step, increment_covariance(step, self._motion))).covariance,
+            self._motion.fault_probability,
+        )
+        if steps is None:
+            return 0.0 if self.odometry.covers(stamps[-1]) else None
+        if steps > 1:
+            self.odometry.remove_between(last, last + steps * interval)
+        return (steps - 1) * seconds
 
     def predict(self, stamp: int) -> Prediction:
         """The motion from the last scan to the scan at ``stamp``, ns; none at the first scan."""
@@ -352,38 +353,3 @@ class MotionModel:
         if self._state.since_keyframe is not None:
             self.noise.learn(self._state.since_keyframe, increment, information)
         self._state = replace(self._state, since_keyframe=NO_MOTION)
-
-
-def _squared_accelerations(motion: MotionParameters) -> Float64:
-    """Squares of the robot's accelerations, on the diagonal (3, 3), m^2/s^4 and rad^2/s^4."""
-    return np.diag([motion.acceleration**2, motion.acceleration**2, math.radians(motion.turn_acceleration) ** 2])
-
-
-def increment_covariance(increment: Float64, motion: MotionParameters) -> Float64:
-    """Covariance (3, 3) of an odometry increment in the frame of its end, m and rad."""
-    return path_covariance(math.hypot(increment[0], increment[1]), abs(float(se2.wrap(increment[2]))), motion)
-
-
-def path_covariance(distance: float, angle: float, motion: MotionParameters) -> Float64:
-    """Covariance (3, 3) of the odometry over a path, in the frame of its end, m and rad.
-
-    Standard deviations grow linearly with the distance (m) and the angle (rad) traveled; the lateral deviation equals
-    the longitudinal one.
-    """
-    translation, rotation = path_standard_deviations(distance, angle, motion)
-    return np.array(((translation**2, 0.0, 0.0), (0.0, translation**2, 0.0), (0.0, 0.0, rotation**2)))
-
-
-def path_standard_deviations(distance: Length, angle: Length, motion: MotionParameters) -> tuple[Length, Length]:
-    """The deviations of translation (m), in either direction, and rotation (rad) that `path_covariance` squares.
-
-    :param distance: m, a number or an array.
-    :param angle: rad, likewise.
-    """
-    translation = (
-        motion.translation_floor
-        + motion.translation_from_translation * distance
-        + motion.translation_from_rotation * (angle * _DEGREES)
-    )
-    rotation = (motion.rotation_floor + motion.rotation_from_translation * distance) * _RADIANS
-    return translation, rotation + motion.rotation_from_rotation * angle

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import takewhile
 
 import numpy as np
 
@@ -54,6 +55,15 @@ class OdometryBuffer:
         if self._readings and reading.stamp < self._readings[-1].stamp:
             self._readings.clear()
         self._readings.append(reading)
+
+    def poses_at(self, stamps: Iterable[int]) -> Iterator[Float64]:
+        """``odom_T_base`` (3,) at increasing stamps (ns), up to the newest reading."""
+        newest = self._readings[-1].stamp if self._readings else -1
+        return map(self._extrapolated_pose, takewhile(lambda stamp: stamp <= newest, stamps))
+
+    def remove_between(self, start: int, end: int) -> None:
+        """Remove the readings between two stamps (ns), without those at the stamps."""
+        self._readings = deque(reading for reading in self._readings if not start < reading.stamp < end)
 
     def covers(self, stamp: int) -> bool:
         """Whether there is a reading at or after ``stamp`` (ns)."""

@@ -9,9 +9,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int8
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.se2 import rotate_back, wrap_by_modulus
 from hmt_slam_ros.sensors.scan import Scan

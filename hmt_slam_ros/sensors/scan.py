@@ -14,9 +14,9 @@ from statistics import median
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float32, Float64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry import se2
 
 _MICROSECONDS = 1e6
@@ -102,7 +102,8 @@ class Scan:
 
     def __post_init__(self) -> None:
         for name in ("angle_min", "angle_increment", "range_min", "range_max", "time_increment"):
-            object.__setattr__(self, name, float(np.float32(getattr(self, name))))
+            with np.errstate(over="ignore"):  # beyond float32 it is infinite, which the checks of a scan refuse
+                object.__setattr__(self, name, float(np.float32(getattr(self, name))))
 
     @property
     def sweep_duration(self) -> float:

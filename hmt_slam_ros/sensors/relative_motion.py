@@ -1,0 +1,79 @@
+"""The motion between two scans, and the noise of odometry over a path."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration.metric_slam import MotionParameters
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import matrix_inverse, propagate_covariance
+
+_DEGREES, _RADIANS = 180.0 / math.pi, math.pi / 180.0
+
+Length = TypeVar("Length", float, Float64)
+
+
+class RelativeMotion(NamedTuple):
+    """A motion between two scans.
+
+    :ivar increment: shape (3,), ``start_T_end``.
+    :ivar covariance: shape (3, 3), in the frame of its end.
+    """
+
+    increment: Float64
+    covariance: Float64
+
+    def compose(self, other: RelativeMotion) -> RelativeMotion:
+        """Both motions, one after the other."""
+        before = propagate_covariance(self.covariance, other.increment)
+        return RelativeMotion(se2.compose(self.increment, other.increment), before + other.covariance)
+
+    def fuse(self, other: RelativeMotion) -> RelativeMotion:
+        """The same motion from two independent sources: the product of both Gaussians."""
+        gain = self.covariance @ matrix_inverse(self.covariance + other.covariance)
+        difference = se2.log(se2.between(self.increment, other.increment))
+        increment = se2.compose(self.increment, se2.exp(gain @ difference))
+        return RelativeMotion(increment, self.covariance - gain @ self.covariance)
+
+
+NO_MOTION = RelativeMotion(np.zeros(3), np.zeros((3, 3)))
+"""No motion, without uncertainty."""
+
+
+def squared_accelerations(motion: MotionParameters) -> Float64:
+    """Squares of the robot's accelerations, on the diagonal (3, 3), m^2/s^4 and rad^2/s^4."""
+    return np.diag([motion.acceleration**2, motion.acceleration**2, math.radians(motion.turn_acceleration) ** 2])
+
+
+def increment_covariance(increment: Float64, motion: MotionParameters) -> Float64:
+    """Covariance (3, 3) of an odometry increment in the frame of its end, m and rad."""
+    return path_covariance(math.hypot(increment[0], increment[1]), abs(float(se2.wrap(increment[2]))), motion)
+
+
+def path_covariance(distance: float, angle: float, motion: MotionParameters) -> Float64:
+    """Covariance (3, 3) of the odometry over a path, in the frame of its end, m and rad.
+
+    Standard deviations grow linearly with the distance (m) and the angle (rad) traveled; the lateral deviation equals
+    the longitudinal one.
+    """
+    translation, rotation = path_standard_deviations(distance, angle, motion)
+    return np.array(((translation**2, 0.0, 0.0), (0.0, translation**2, 0.0), (0.0, 0.0, rotation**2)))
+
+
+def path_standard_deviations(distance: Length, angle: Length, motion: MotionParameters) -> tuple[Length, Length]:
+    """The deviations of translation (m), in either direction, and rotation (rad) that `path_covariance` squares.
+
+    :param distance: m, a number or an array.
+    :param angle: rad, likewise.
+    """
+    translation = (
+        motion.translation_floor
+        + motion.translation_from_translation * distance
+        + motion.translation_from_rotation * (angle * _DEGREES)
+    )
+    rotation = (motion.rotation_floor + motion.rotation_from_translation * distance) * _RADIANS
+    return translation, rotation + motion.rotation_from_rotation * angle
