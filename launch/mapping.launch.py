@@ -67,7 +67,7 @@ def _view() -> Node:
         package=PACKAGE,
         executable="view",
         namespace=LaunchConfiguration("namespace"),
-        parameters=[{"port": value("view_port", int)}],
+        parameters=[{"port": value("view_port", int), "system": value("system", str)}],
         output="screen",
         condition=IfCondition(LaunchConfiguration("view")),
         **RESPAWN,

@@ -137,7 +137,9 @@ EVENTS = f'{{"document":"area_events","version":4,"sequence":3,"events":[{EVENT}
         ('"sequence":3,', "", r"area_events\.sequence is missing"),
         ('"sequence":3', '"sequence":3,"colour":1', r"area_events\.colour is unknown"),
         ('"kind":"cut"', '"kind":"torn"', r"area_events\.events\[0\]\.kind = torn is not cut or moved or merged"),
-        ('"score":0.5', '"score":NaN', r"score = nan is not a finite number"),
+        ('"score":0.5', '"score":NaN', r"no JSON \(NaN is no finite number"),
+        ('"sequence":3', '"sequence":1' + 400 * "0", r"no JSON \(an integer of 401 digits"),
+        ('"version":4', f'"version":{60 * "[" + 60 * "]"}', r"has version \[\[\["),
         ('"keyframes":[1,2]', '"keyframes":[1,2.5]', r"keyframes\[1\] = 2.5 is not a whole number"),
         ('"keyframes":[1,2]', '"keyframes":1', r"keyframes = 1 is not a list"),
         ("[]}", "[]", "no JSON"),
@@ -165,7 +167,7 @@ def test_an_array_of_another_shape_or_kind_is_refused(covariance):
     belief = PoseGaussian(np.zeros(3), np.eye(3))
     content = json.loads(encode(LocalEstimate(1, 0, 0, belief, np.zeros(3), 0)))
     content["pose"]["covariance"] = json.loads(covariance)
-    with pytest.raises(HmtSlamError, match=r"local_estimate\.pose\.covariance = .* is not an array"):
+    with pytest.raises(HmtSlamError, match=r"local_estimate\.pose\.covariance = .* is not an array|NaN is no finite"):
         decode(json.dumps(content), LocalEstimate)
 
 
@@ -175,7 +177,7 @@ def test_a_number_that_is_not_finite_is_not_sent(value):
         encode(LocalEstimate(1, 0, 0, PoseGaussian(np.zeros(3), np.eye(3)), np.full(3, value), 0))
 
 
-@pytest.mark.parametrize("text", ["[]", "3", "null", '"text"', ""])
+@pytest.mark.parametrize("text", ["[]", "3", "null", '"text"', "", "hello", 100_000 * "["])
 def test_json_that_is_no_document_is_refused(text):
     with pytest.raises(HmtSlamError):
         decode(text, RobotStatus)

@@ -98,14 +98,14 @@ def test_where_a_part_of_the_map_never_comes_it_ends_with_a_sentence(listener, s
         node.communicate()
     writer = listener.node.create_publisher(String, KEYFRAMES, topics.CHAIN)
     scans = listener.node.create_publisher(LaserScan, KEYFRAME_SCANS, topics.CHAIN)
-    document = json.loads(keyframes[2].data)
-    assert document["sequence"] == 2
+    ahead = [json.dumps({**json.loads(keyframes[2].data), "sequence": sequence}) for sequence in (2, 3, 4)]
     late = start("explorer", laser_pose="[0.0,0.0,0.0]")
     scan = LaserScan(angle_min=-3.0, angle_max=3.0, angle_increment=0.1, range_max=10.0, ranges=[1.0] * 61)
-    scan.header.frame_id = keyframe_frame(2, 0)
     listener.until(lambda: writer.get_subscription_count() > 0)
-    writer.publish(keyframes[2])
-    scans.publish(scan)
+    for sequence, document in enumerate(ahead, 2):
+        scan.header.frame_id = keyframe_frame(sequence)
+        writer.publish(String(data=document))
+        scans.publish(scan)
     error = late.communicate(timeout=60.0)[1]
     assert late.returncode == 2
     assert "Keyframe 0 never came, 2 did" in error

@@ -228,7 +228,7 @@ def test_what_comes_late_twice_or_out_of_order_is_left_out_and_counted_and_all_e
     for name in ("slam", "rtl"):
         nodes.until(lambda name=name: nodes.diagnosis(name)["refused on odom"] == refused[Odometry])
         assert nodes.diagnosis(name)["received Odometry"] == str(len(used[Odometry]))
-        assert " came late or twice, after that of " in nodes.diagnosis(name)["last error"]
+        assert " came late, twice or far ahead, beside that of " in nodes.diagnosis(name)["last error"]
     assert not nodes.notices
     driver.close()
 

@@ -128,6 +128,7 @@ def test_a_paced_robot_waits_for_the_acknowledgement(tmp_path, listener, start, 
         robot__rate=0.0,
         robot__max_unacknowledged_scans=4,
         filter__max_scans_waiting_for_odometry=3,
+        motion__patience=0.0,
     )
     listener.until(lambda: len(received_topics["scan"]) == 4)
     listener.spin(0.5)

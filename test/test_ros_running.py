@@ -12,8 +12,8 @@ import rclpy
 from rclpy.node import Node
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.ros.chain_writer import RCLError
 from hmt_slam_ros.ros.execution import run
-from hmt_slam_ros.ros.message_io import RCLError
 from hmt_slam_ros.ros.process_node import ProcessNode
 
 

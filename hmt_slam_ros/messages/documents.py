@@ -7,7 +7,7 @@ received document is checked against that class, so that no malformed message re
 from __future__ import annotations
 
 import json
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, fields
 from typing import Literal, TypeVar
 
@@ -21,6 +21,7 @@ from hmt_slam_ros.plain_data import PlainDataReader, Reader, to_plain
 from hmt_slam_ros.process_table import DOCUMENTS
 from hmt_slam_ros.saved_map.folder import FileRecord
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.untrusted_input import parse_json, shorten
 
 Document = TypeVar("Document")
 
@@ -169,16 +170,19 @@ _DOCUMENTS: dict[type, tuple[str, int]] = {row.message_class: (row.document, row
 """{class of a message: (name, version) of its document}."""
 
 
-def encode(message: object, reset_number: int = 0) -> str:
+def encode(message: object, reset_number: int = 0, system: str = "") -> str:
     """The JSON document of a message, of a :class:`KeyframeHeader`, :class:`FinalCounts` or :class:`RobotStatus`.
 
     :param reset_number: number of the last reset, 0 before the first.
+    :param system: name of the sender's system, empty where it has none.
     :raises HmtSlamError: where a float is NaN or infinite.
     """
     name, version = _DOCUMENTS[type(message)]
     content = {"document": name, "version": version, **to_plain(message, {np.ndarray: np.ndarray.tolist})}
     if reset_number:
         content["reset"] = reset_number
+    if system:
+        content["system"] = system
     try:
         return json.dumps(content, allow_nan=False, separators=(",", ":"))
     except ValueError as error:
@@ -194,26 +198,26 @@ def decode(text: str, kind: type[Document]) -> Document:
     return decode_with_reset(text, kind)[0]
 
 
-def decode_with_reset(text: str, kind: type[Document]) -> tuple[Document, int]:
+def decode_with_reset(
+    text: str, kind: type[Document], admit: Callable[[str], None] = lambda _: None
+) -> tuple[Document, int]:
     """The message of a JSON document, and the reset number of its sender.
 
+    :param admit: called with the name of the sender's system before the message is read; raises an error to refuse it.
     :raises HmtSlamError: as :func:`decode`.
     """
     name, version = _DOCUMENTS[kind]
-    try:
-        content = json.loads(text)
-    except ValueError as error:
-        raise HmtSlamError(
-            f"a {name} document is no JSON ({error}): see docs/reference/messages.md for its form"
-        ) from error
+    content = parse_json(text, f"a {name} document")
     if not isinstance(content, dict) or content.pop("document", None) != name:
         raise HmtSlamError(
             f"a document that is no {name} came on its topic: see docs/reference/messages.md for its form"
         )
     if (found := content.pop("version", None)) != version:
         raise HmtSlamError(
-            f"a {name} document has version {found}, not {version}: run the same version of hmt_slam_ros everywhere"
+            f"a {name} document has version {shorten(found)}, not {version}: run the same version of hmt_slam_ros "
+            "everywhere"
         )
+    admit(_VALUES.read(content.pop("system", ""), str, f"{name}.system"))
     reset_number = _VALUES.read(content.pop("reset", 0), int, f"{name}.reset")
     return _VALUES.read(content, kind, name), reset_number
 

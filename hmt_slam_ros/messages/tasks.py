@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.untrusted_input import is_short_text, shorten
 
 TaskKind = Literal["explore", "go", "backtrack", "localize", "stop"]
 
@@ -41,10 +42,10 @@ def parse_task(text: str, kinds: Sequence[TaskKind]) -> Task:
     """
     word, _, place = text.strip().partition(" ")
     for kind in kinds:
-        if kind == word and bool(place) == (kind == "go"):
+        if kind == word and bool(place) == (kind == "go") and is_short_text(place):
             return Task(kind, place)
     alone = ", ".join(kind for kind in kinds if kind != "go")
-    raise HmtSlamError(f"'{text}' is no task: give one of {alone}, or go and the name of a place")
+    raise HmtSlamError(f"'{shorten(text)}' is no task: give one of {alone}, or go and the name of a place")
 
 
 @dataclass(frozen=True, slots=True)

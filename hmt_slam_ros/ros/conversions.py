@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -36,14 +36,23 @@ from hmt_slam_ros.logs.mounting import heading_from_quaternion
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.messages import ScanPoses
 from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.plausibility import (
+    MAX_COORDINATE,
+    MAX_STAMP,
+    check_odometry,
+    check_planar_pose,
+    check_quaternion,
+)
+from hmt_slam_ros.untrusted_input import shorten
 
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 """Rows and columns of (x, y, theta) in the 6 x 6 covariance of ROS, which is (x, y, z, roll, pitch, yaw)."""
 _NUDGES = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (2, 0), (-2, 0), (0, 2), (0, -2))
 """Corrections of (z, w) of a quaternion that are tried, units in the last place, the smallest first."""
-_SCAN_POSES_FRAME = re.compile(r"hypothesis_(\d+)/scan_(\d+)")
-_AREA_FRAME = re.compile(r"area_(\d+)")
-_KEYFRAME_FRAME = re.compile(r"keyframe_(\d+)(?:/reset_(\d+))?")
+_SCAN_POSES_FRAME = re.compile(r"hypothesis_(\d{1,18})/scan_(\d{1,18})(?:/system_(.{1,100}))?")
+_COST_LABEL = re.compile(r"(\w{1,100})(?:/system_(.{1,100}))?")
+_AREA_FRAME = re.compile(r"area_(\d{1,18})")
+_KEYFRAME_FRAME = re.compile(r"keyframe_(\d{1,18})(?:/reset_(\d{1,19}))?(?:/system_(.{1,100}))?")
 
 
 def time_message(stamp: int) -> Time:
@@ -83,9 +92,16 @@ def pose_message(pose: NDArray[np.float64]) -> Pose:
 
 
 def pose_from_message(pose: Pose) -> NDArray[np.float64]:
-    """(x, y, theta) of a ROS pose."""
+    """(x, y, theta) of a ROS pose.
+
+    :raises HmtSlamError: where a number is not finite or far beyond any map, or the quaternion is no rotation.
+    """
     q = pose.orientation
-    return np.array([pose.position.x, pose.position.y, heading_from_quaternion((q.x, q.y, q.z, q.w))])
+    quaternion = (q.x, q.y, q.z, q.w)
+    check_quaternion(quaternion)
+    x_y_theta = np.array([pose.position.x, pose.position.y, heading_from_quaternion(quaternion)])
+    check_planar_pose(x_y_theta, "pose", MAX_COORDINATE)
+    return x_y_theta
 
 
 def transform_message(stamp: int, parent: str, child: str, parent_T_child: NDArray[np.float64]) -> TransformStamped:
@@ -142,8 +158,11 @@ def odometry_message(reading: Odometry, odom_frame: str, base_frame: str) -> Odo
 
 
 def odometry_from_message(message: OdometryMessage) -> Odometry:
-    """Odometry reading of ROS odometry."""
-    return Odometry(stamp_from_time(message.header.stamp), pose_from_message(message.pose.pose))
+    """Odometry reading of ROS odometry.
+
+    :raises HmtSlamError: where it is none; names the field, its value and the remedy.
+    """
+    return check_odometry(Odometry(stamp_from_time(message.header.stamp), pose_from_message(message.pose.pose)))
 
 
 def pose_with_covariance_message(stamp: int, frame: str, belief: PoseGaussian) -> PoseWithCovarianceStamped:
@@ -161,7 +180,10 @@ def pose_with_covariance_message(stamp: int, frame: str, belief: PoseGaussian) -
 
 
 def gaussian_from_message(message: PoseWithCovariance) -> PoseGaussian:
-    """The inverse of :func:`pose_with_covariance_message`."""
+    """The inverse of :func:`pose_with_covariance_message`.
+
+    :raises HmtSlamError: where the pose is none; the covariance is not checked.
+    """
     mean = pose_from_message(message.pose)
     axes = _rotation(mean[2])
     return PoseGaussian(mean, axes.T @ np.reshape(message.covariance, (6, 6))[_PLANAR] @ axes)
@@ -186,38 +208,52 @@ def area_from_frame(frame: str) -> int:
     return int(_match_frame(_AREA_FRAME, frame)[1])
 
 
-def keyframe_frame(keyframe: int, reset_number: int = 0) -> str:
-    """Name of a keyframe's frame; ``reset_number`` is that of the last reset, 0 before the first."""
-    return f"keyframe_{keyframe}/reset_{reset_number}" if reset_number else f"keyframe_{keyframe}"
+def keyframe_frame(keyframe: int, reset_number: int = 0, system: str = "") -> str:
+    """Name of a keyframe's frame.
+
+    :param reset_number: number of the last reset, 0 before the first.
+    :param system: name of the sender's system, empty where it has none.
+    """
+    reset = f"/reset_{reset_number}" if reset_number else ""
+    return f"keyframe_{keyframe}{reset}{_system_suffix(system)}"
 
 
-def keyframe_from_frame(frame: str) -> tuple[int, int]:
-    """The keyframe and the reset number of a keyframe's frame.
+def keyframe_from_frame(frame: str) -> tuple[int, int, str]:
+    """The keyframe, the reset number and the name of the sender's system of a keyframe's frame.
 
     :raises HmtSlamError: for any other frame.
     """
     match = _match_frame(_KEYFRAME_FRAME, frame)
-    return int(match[1]), int(match[2] or 0)
+    return int(match[1]), int(match[2] or 0), match[3] or ""
 
 
-def path_message(scan_poses: ScanPoses) -> Path:
-    """Scan poses as a path, every pose in the frame of its keyframe."""
+def _system_suffix(system: str) -> str:
+    return f"/system_{system}" if system else ""
+
+
+def path_message(scan_poses: ScanPoses, system: str = "") -> Path:
+    """Scan poses as a path, every pose in the frame of its keyframe.
+
+    :param system: name of the sender's system, empty where it has none.
+    """
     rows = zip(scan_poses.stamps.tolist(), scan_poses.keyframes.tolist(), scan_poses.poses, strict=True)
     poses = [
         PoseStamped(header=header_message(stamp, keyframe_frame(keyframe)), pose=pose_message(pose))
         for stamp, keyframe, pose in rows
     ]
     stamp = int(scan_poses.stamps[0]) if scan_poses.stamps.size else 0
-    frame = f"hypothesis_{scan_poses.hypothesis}/scan_{scan_poses.first_scan}"
+    frame = f"hypothesis_{scan_poses.hypothesis}/scan_{scan_poses.first_scan}{_system_suffix(system)}"
     return Path(header=header_message(stamp, frame), poses=poses)
 
 
-def scan_poses_from_message(message: Path) -> ScanPoses:
+def scan_poses_from_message(message: Path, admit: Callable[[str], None] = lambda _: None) -> ScanPoses:
     """The inverse of :func:`path_message`.
 
+    :param admit: called with the name of the sender's system; raises an error to refuse the message.
     :raises HmtSlamError: for other names of frames.
     """
     match = _match_frame(_SCAN_POSES_FRAME, message.header.frame_id)
+    admit(match[3] or "")
     return ScanPoses(
         int(match[1]),
         int(match[2]),
@@ -230,8 +266,37 @@ def scan_poses_from_message(message: Path) -> ScanPoses:
 def _match_frame(pattern: re.Pattern[str], frame: str) -> re.Match[str]:
     match = pattern.fullmatch(frame)
     if match is None:
-        raise HmtSlamError(f"frame '{frame}' is not of the form {pattern.pattern}: run the same version everywhere")
+        raise HmtSlamError(
+            f"frame '{shorten(frame)}' is not of the form {pattern.pattern}: run the same version everywhere"
+        )
     return match
+
+
+def cost_message(name: str, system: str, costs: Sequence[tuple[int, float]]) -> Float64MultiArray:
+    """Rows of (stamp in s, its rest in ns, seconds of computing); one float64 cannot hold a stamp exactly.
+
+    :param name: of the node.
+    :param system: name of its system, empty where it has none.
+    :param costs: (stamp of a scan, ns, seconds of computing).
+    """
+    rows = [(*divmod(stamp, NANOSECONDS), seconds) for stamp, seconds in costs]
+    return table_message(f"{name}{_system_suffix(system)}", ("stamp_sec", "stamp_nanosec", "seconds"), rows)
+
+
+def costs_from_message(
+    message: Float64MultiArray, admit: Callable[[str], None] = lambda _: None
+) -> tuple[str, NDArray[np.float64]]:
+    """The name of the node, and its rows, shape (n, 3): the inverse of :func:`cost_message`.
+
+    :param admit: called with the name of the sender's system; raises an error to refuse the message.
+    :raises HmtSlamError: for another table, or numbers that are no costs.
+    """
+    match = _match_frame(_COST_LABEL, message.layout.dim[0].label if message.layout.dim else "")
+    admit(match[2] or "")
+    data = np.array(message.data, dtype=np.float64)
+    if data.size % 3 or not ((data >= 0.0) & (data < MAX_STAMP / NANOSECONDS)).all():
+        raise HmtSlamError(f"a table of {data.size} numbers holds no costs: run the same version everywhere")
+    return match[1], data.reshape(-1, 3)
 
 
 def table_message(label: str, columns: Sequence[str], rows: Sequence[Sequence[float]]) -> Float64MultiArray:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import time
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,16 +14,26 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
-from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import Keyframe, LocalEstimate, Message
+from hmt_slam_ros.messages.system_name import SystemName
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import table_message
+from hmt_slam_ros.ros.conversions import cost_message
 from hmt_slam_ros.ros.topics import COST, DIAGNOSTICS
+from hmt_slam_ros.untrusted_input import shorten
 
 PERIOD = 1.0
 """Time between two messages on /diagnostics, s."""
 STATE, ACTIVE = "state", "active"
 """Key of the lifecycle state in /diagnostics, and its value for an active node."""
+SYSTEM, SECOND_SYSTEM = "system", "second system"
+"""Keys of the name of a node's system in /diagnostics, and of another system that speaks on its topics."""
+_MAX_CAUSES = 20
+"""Different causes of refusals on a topic that are logged; more are only counted."""
+_MAX_SENTENCE = 400
+"""Characters of a refusal, whatever a message holds."""
+_CAUSE = re.compile(r"[^=(\d'\[]*")
+"""The beginning of a sentence, up to the first value in it."""
 
 
 class NodeDiagnostics:
@@ -31,15 +42,17 @@ class NodeDiagnostics:
     :ivar received: {message type: count}.
     :ivar sent: {message type: count}.
     :ivar values: further entries, {name: value}.
+    :ivar system: the system that the node belongs to.
+    :ivar crowded_topic: a topic with more publishers than one system has, and their number; empty without.
     :ivar steady_clock: clock for timers that run while simulated time stands still.
     """
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    def __init__(self, node: Node, system: SystemName) -> None:
+        self._node, self.system, self.crowded_topic = node, system, ""
         self.clear()
         self._clock = Clock(clock_type=ClockType.SYSTEM_TIME)
         self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
-        self._cost = node.create_publisher(Float64MultiArray, COST, topics.CHAIN)
+        self._cost = node.create_publisher(Float64MultiArray, COST, topics.COST_HISTORY)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(PERIOD, self.publish, clock=self.steady_clock)
 
@@ -48,6 +61,8 @@ class NodeDiagnostics:
         self.received: Counter[str] = Counter()
         self.sent: Counter[str] = Counter()
         self.values: dict[str, object] = {}
+        self._refused: Counter[str] = Counter()
+        self._causes: defaultdict[str, set[str]] = defaultdict(set)
         self._error = ""
         self._level = DiagnosticStatus.OK
         self._last_stamp = 0
@@ -59,6 +74,30 @@ class NodeDiagnostics:
     def warn(self, sentence: str) -> None:
         """Record and log a fault that the node survives; a repeated sentence is logged once."""
         self._record_fault(sentence, DiagnosticStatus.WARN)
+
+    def refuse(self, topic: str, fault: HmtSlamError) -> None:
+        """Count a message that is left out, and log the first one of each cause.
+
+        :param topic: name of its topic or service.
+        :param fault: names the value and the remedy.
+        """
+        self.count_refused(topic)
+        sentence = str(fault)[:_MAX_SENTENCE]
+        if self.is_new_cause(topic, shorten(_CAUSE.match(sentence)[0])):  # type: ignore[index]
+            self.warn(f"{topic} is left out: {sentence}")
+
+    def is_new_cause(self, topic: str, cause: str) -> bool:
+        """Whether a cause of refusals on a topic is the first of its kind, and is to be logged."""
+        causes = self._causes[topic]
+        if cause in causes or len(causes) == _MAX_CAUSES:
+            return False
+        causes.add(cause)
+        return True
+
+    def count_refused(self, topic: str, count: int = 1) -> None:
+        """Count messages of a topic that are left out."""
+        self._refused[topic] += count
+        self.values[f"refused on {topic}"] = self._refused[topic]
 
     def fail(self, sentence: str) -> None:
         """Record and log a fault that the run does not survive."""
@@ -101,6 +140,7 @@ class NodeDiagnostics:
         values = {
             **self._counts_and_rates(),
             **self.values,
+            **self._system_values(),
             "messages handled": self._handled,
             "busy": f"{self._busy_seconds:.3f} s",
             "longest message": f"{1e3 * self._longest:.1f} ms",
@@ -118,6 +158,11 @@ class NodeDiagnostics:
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._clock.now().to_msg()
         self._publisher.publish(message)
+
+    def _system_values(self) -> dict[str, object]:
+        """The system of the node, and another one that speaks on its topics; an entry only where there is one."""
+        values = {SYSTEM: self.system.name, SECOND_SYSTEM: self.system.other or self.crowded_topic}
+        return {key: value for key, value in values.items() if value}
 
     @property
     def _status_text(self) -> str:
@@ -140,7 +185,7 @@ class NodeDiagnostics:
 
     def _publish_costs(self) -> None:
         if self._costs:
-            self._cost.publish(_cost_message(self._node.get_name(), self._costs))
+            self._cost.publish(cost_message(self._node.get_name(), self.system.name, self._costs))
             self._costs = []
 
 
@@ -149,12 +194,6 @@ def _message_stamp(message: Message, default: int) -> int:
     if isinstance(message, Keyframe):
         return message.scan.stamp
     return int(getattr(message, "stamp", default))
-
-
-def _cost_message(name: str, costs: Sequence[tuple[int, float]]) -> Float64MultiArray:
-    """Rows of (stamp in s, its rest in ns, seconds of computing); one float64 cannot hold a stamp exactly."""
-    rows = [(*divmod(stamp, NANOSECONDS), seconds) for stamp, seconds in costs]
-    return table_message(name, ("stamp_sec", "stamp_nanosec", "seconds"), rows)
 
 
 def peak_rss(process: int | str = "self") -> int:

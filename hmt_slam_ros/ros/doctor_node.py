@@ -156,7 +156,10 @@ class DoctorNode(Node):
     def _on_odometry(self, message: OdometryMessage) -> None:
         self._count_message(running.ODOM, conversions.stamp_from_time(message.header.stamp))
         self._odometry_frames = (frame_name(message.header.frame_id), frame_name(message.child_frame_id))
-        self._readings.append(conversions.odometry_from_message(message))
+        try:
+            self._readings.append(conversions.odometry_from_message(message))
+        except HmtSlamError as fault:
+            self.get_logger().warning(str(fault), once=True)
 
     def _count_message(self, topic: str, stamp: int) -> None:
         self._counts[topic] += 1

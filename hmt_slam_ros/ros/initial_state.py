@@ -21,10 +21,12 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
 from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions
 from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
+from hmt_slam_ros.process_table import COORDINATOR
 from hmt_slam_ros.results.log_reading import describe_parameter_changes, map_folder
 from hmt_slam_ros.ros.parameters import ConfiguredNode
 from hmt_slam_ros.ros.recovery import CHECKPOINT
 from hmt_slam_ros.saved_map.folder import CONFIGURATION, FORMAT, VERSION, FolderReader
+from hmt_slam_ros.saved_map.validation import check_slam_state
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -69,6 +71,7 @@ class InitialState:
         :raises HmtSlamError: where the map is damaged, or differs from the node in a fixed parameter.
         """
         self.events, self.lost, self.previous_scans = 0, lost and bool(path), previous_scans
+        self._configuration = node.configuration
         self._reader: FolderReader | None = None
         self.folder: Path | None = None
         if path:
@@ -115,7 +118,10 @@ class InitialState:
             raise HmtSlamError(
                 f"the map to start from lacks the part {name}: give one that hmt_slam map wrote or nodes saved"
             )
-        return self._reader.read(name, kind)
+        part = self._reader.read(name, kind)
+        if name == COORDINATOR:
+            check_slam_state(part, self._configuration)
+        return part
 
     @cached_property
     def map(self) -> MapDocument | None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
+from launch import LaunchContext, Substitution
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration, LaunchLogDir, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
@@ -14,6 +17,14 @@ from launch_ros.substitutions import FindPackageShare
 PACKAGE = "hmt_slam_ros"
 RESPAWN = {"respawn": True, "respawn_delay": 1.0, "respawn_max_retries": 3}
 """Options of a node that is started again where it was killed."""
+
+
+class LaunchName(Substitution):
+    """Name of a launch, after its folder of logs; no other launch has the same."""
+
+    def perform(self, context: LaunchContext) -> str:
+        """The name, with the characters that the name of a system may have."""
+        return re.sub(r"[^\w.:+-]", "_", Path(LaunchLogDir().perform(context)).name, flags=re.ASCII)[-100:]
 
 
 def shared_path(*parts: str) -> PathJoinSubstitution:
@@ -35,6 +46,11 @@ def common_arguments() -> list[DeclareLaunchArgument]:
             description="YAML file with the parameters.",
         ),
         DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
+        DeclareLaunchArgument(
+            "system",
+            default_value=LaunchName(),
+            description="Name of the system, of which the nodes take messages; by default another one for each launch.",
+        ),
         switch("view", "false", "Whether the live page is served."),
     ]
 
@@ -55,12 +71,12 @@ def value(name: str, kind: type) -> ParameterValue:
 
 
 def node(executable: str, parameters: dict[str, Any], **options: Any) -> Node:  # noqa: ANN401  of launch_ros
-    """Node of this package, with the parameter file and further parameters."""
+    """Node of this package, with the parameter file, the name of the system and further parameters."""
     return Node(
         package=PACKAGE,
         executable=executable,
         namespace=LaunchConfiguration("namespace"),
-        parameters=[LaunchConfiguration("params_file"), parameters],
+        parameters=[LaunchConfiguration("params_file"), {"system": value("system", str), **parameters}],
         output="screen",
         **options,
     )

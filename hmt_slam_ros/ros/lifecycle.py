@@ -17,6 +17,7 @@ from rclpy.lifecycle.node import TransitionCallbackReturn
 from rclpy.time_source import CLOCK_TOPIC
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.messages.system_name import SystemName
 from hmt_slam_ros.ros.diagnostics import STATE, NodeDiagnostics
 from hmt_slam_ros.ros.parameters import ConfiguredNode
 
@@ -39,13 +40,14 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         self.is_configured = self.is_active = False
         self._fault: Exception | None = None
         self._parameter_fault: HmtSlamError | None = None
+        self.system = SystemName()
         try:
             ConfiguredNode.__init__(self, name)
             self.declare_own_parameters()
         except HmtSlamError as fault:
             self._parameter_fault = fault
         self._autostart = bool(self.declare_parameter("autostart", True, _AUTOSTART).value)
-        self.diagnostics = NodeDiagnostics(self)
+        self.diagnostics = NodeDiagnostics(self, self.system)
         LifecycleNodeMixin.__init__(self)
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._handle_change_state

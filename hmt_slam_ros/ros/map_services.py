@@ -7,7 +7,6 @@ processes for theirs. It handles nothing until all have answered, so that all pa
 from __future__ import annotations
 
 import shutil
-import tempfile
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -23,16 +22,19 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.messages.documents import ResetRequest, ResetResponse, SaveRequest, SaveResponse, decode, encode
+from hmt_slam_ros.messages.documents import ResetRequest, ResetResponse, SaveRequest, SaveResponse, encode
 from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.own_files import ScratchFolder, replace_folder
 from hmt_slam_ros.process_table import participant_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.initial_state import InitialState
 from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
+from hmt_slam_ros.ros.message_io import subscribe_document
 from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.topics import DOCUMENTS
-from hmt_slam_ros.saved_map.folder import HMT_MAP, MANIFEST, replace_folder
+from hmt_slam_ros.saved_map.folder import FORMAT, HMT_MAP, foreign_entry
+from hmt_slam_ros.untrusted_input import shorten
 
 if TYPE_CHECKING:
     from hmt_slam_ros.metric_slam.slam import MetricSlam
@@ -97,12 +99,12 @@ class RequestCoordinator(ABC):
         :param failure: what cannot be done, the start of each sentence about a fault.
         """
         self.is_blocking = False
-        self._node, self._on_release, self._response_type, self._failure = node, on_release, response_type, failure
+        self._node, self._on_release, self._failure = node, on_release, failure
         self._outcome: Future | None = None
         self._requested_at, self._number = 0.0, 0
         self._responses: dict[str, SaveResponse | ResetResponse] = {}
         self._request_publisher = node.create_publisher(String, DOCUMENTS[request_type], topics.CHAIN)
-        node.create_subscription(String, DOCUMENTS[response_type], self._on_response, topics.VOLATILE_CHAIN)
+        subscribe_document(node, response_type, self._on_response, topics.VOLATILE_CHAIN)
         node.create_timer(PERIOD, self._check_timeout, clock=node.diagnostics.steady_clock)
 
     @property
@@ -135,7 +137,7 @@ class RequestCoordinator(ABC):
         except (HmtSlamError, OSError) as fault:
             self._end(f"{self._failure}: {fault}")
         else:
-            self._request_publisher.publish(String(data=encode(request)))
+            self._request_publisher.publish(String(data=encode(request, system=self._node.system.name)))
 
     @abstractmethod
     def _make_request(self, number: int, events: int) -> SaveRequest | ResetRequest:
@@ -157,8 +159,7 @@ class RequestCoordinator(ABC):
     def _clean_up(self) -> None:
         """Remove temporary data, whatever the outcome."""
 
-    def _on_response(self, message: String) -> None:
-        response = decode(message.data, self._response_type)
+    def _on_response(self, response: SaveResponse | ResetResponse) -> None:
         if not self.is_blocking or response.number != self._number:
             return
         self._responses[response.process] = response
@@ -199,12 +200,28 @@ class RequestCoordinator(ABC):
 class _PendingSave(NamedTuple):
     """A save under way: a temporary folder, and the writer of the map in it."""
 
-    scratch: Path
+    scratch: ScratchFolder
     writer: MapWriter
 
     @property
     def folder(self) -> Path:
-        return self.scratch / "new"
+        return self.scratch.path / "new"
+
+
+def check_map_is_replaceable(target: Path) -> None:
+    """Check that a save to a folder removes nothing but a map.
+
+    :raises HmtSlamError: unless there is nothing, or a folder with the files of a map and nothing else.
+    :raises OSError: where it cannot be read.
+    """
+    if not target.exists() and not target.is_symlink():
+        return
+    foreign = target if target.is_symlink() or not target.is_dir() else foreign_entry(target, FORMAT)
+    if foreign is not None:
+        raise HmtSlamError(
+            f"something else than a map stands there, {foreign} is none of its files: set save_to of slam to another "
+            "folder"
+        )
 
 
 class MapSaver(RequestCoordinator):
@@ -238,12 +255,11 @@ class MapSaver(RequestCoordinator):
 
         if self._node.estimate is None:
             raise HmtSlamError("nothing is mapped yet, drive first")
-        if self._target.exists() and not (self._target / MANIFEST).is_file():
-            raise HmtSlamError("something else than a map stands there, set save_to of slam to another folder")
         try:
+            check_map_is_replaceable(self._target)
             self._target.parent.mkdir(parents=True, exist_ok=True)
-            scratch = Path(tempfile.mkdtemp(prefix=f".{self._target.name}.partial-", dir=self._target.parent))
-            self._pending_save = _PendingSave(scratch, MapWriter(scratch / "new"))
+            scratch = ScratchFolder(self._target, self._target.parent)
+            self._pending_save = _PendingSave(scratch, MapWriter(scratch.path / "new"))
             self._pending_save.writer.write_slam_state(self._node.process.state)
             self._node.write_map(self._pending_save.writer)
         except OSError as fault:
@@ -257,6 +273,7 @@ class MapSaver(RequestCoordinator):
                 assert isinstance(response, SaveResponse)
                 self._pending_save.writer.add_files(response.files)
             self._pending_save.writer.finish(self._node.configuration)
+            check_map_is_replaceable(self._target)
             replace_folder(self._copy_unchanged_map() or self._pending_save.folder, self._target)
         except OSError as fault:
             raise HmtSlamError(f"{self._target} cannot be saved: {fault.strerror}; {_REMEDY}") from fault
@@ -266,11 +283,11 @@ class MapSaver(RequestCoordinator):
         """A copy of the loaded map where the robot was only localized in it, else None."""
         assert self._pending_save is not None
         loaded = self._node.unchanged_map_folder
-        return None if loaded is None else Path(shutil.copytree(loaded, self._pending_save.scratch / "kept"))
+        return None if loaded is None else Path(shutil.copytree(loaded, self._pending_save.scratch.path / "kept"))
 
     def _clean_up(self) -> None:
         if self._pending_save is not None:
-            shutil.rmtree(self._pending_save.scratch, ignore_errors=True)
+            self._pending_save.scratch.remove()
         self._pending_save = None
 
 
@@ -278,6 +295,15 @@ def declare_save_to(node: Node) -> Path:
     """Declare ``save_to``, and return the folder for the map."""
     descriptor = ParameterDescriptor(description="Folder into which the service save writes the map.", read_only=True)
     return Path(node.declare_parameter("save_to", HMT_MAP, descriptor).value).absolute()
+
+
+def folder_of_url(url: str) -> Path | None:
+    """The folder that a ``map_url`` names, None where there is none."""
+    folder = Path(url.removeprefix(_FILE_SCHEME)).absolute()
+    try:
+        return folder if folder.is_dir() else None
+    except OSError:  # such as a name that is too long
+        return None
 
 
 class MapLoader(RequestCoordinator):
@@ -306,9 +332,11 @@ class MapLoader(RequestCoordinator):
         if self._node.is_busy:
             self._node.diagnostics.warn("a map is being saved or loaded, so no other one is loaded: ask again")
             return response
-        folder = Path(request.map_url.removeprefix(_FILE_SCHEME)).absolute()
-        if not folder.is_dir():
-            self._node.diagnostics.warn(f"there is no folder {folder}: set map_url to an output folder or hmt_map")
+        folder = folder_of_url(request.map_url)
+        if folder is None:
+            self._node.diagnostics.warn(
+                f"there is no folder {shorten(request.map_url)}: set map_url to an output folder or hmt_map"
+            )
             response.result = LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
             return response
         try:

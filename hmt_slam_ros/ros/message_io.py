@@ -8,21 +8,18 @@ the nodes take the same decisions as the lock-step run, and a late node catches 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
-import rclpy
 from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
-from rclpy.executors import ExternalShutdownException
-from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.messages.documents import FinalCounts, KeyframeHeader, decode, decode_with_reset, encode
+from hmt_slam_ros.messages.documents import FinalCounts, KeyframeHeader, encode
+from hmt_slam_ros.messages.gate import ChainGate, check_message, decode_checked
 from hmt_slam_ros.messages.messages import (
     AreaEvents,
     ClosureDecision,
@@ -34,8 +31,11 @@ from hmt_slam_ros.messages.messages import (
     ScanPoses,
     TrackingReset,
 )
+from hmt_slam_ros.messages.system_name import ForeignDocumentError
 from hmt_slam_ros.ros import conversions, topics
+from hmt_slam_ros.ros.chain_writer import ChainWriter
 from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
+from hmt_slam_ros.ros.guarded_node import GuardedNode
 from hmt_slam_ros.ros.sensor_input import SensorSubscription
 from hmt_slam_ros.ros.topics import DOCUMENTS, FINISHED, KEYFRAME_SCANS, KEYFRAMES, ODOM, SCAN_POSES
 from hmt_slam_ros.sensors import Odometry
@@ -45,34 +45,57 @@ ChainMessage = Keyframe | AreaEvents | Hypotheses | ClosureDecision
 CHAIN: tuple[type, ...] = (Keyframe, AreaEvents, Hypotheses, ClosureDecision)
 """Messages of a keyframe event in their order."""
 
-RCLError = rclpy_implementation.RCLError
-
 
 class ChainOrder:
-    """Puts the messages of the chain into order, and detects repetitions and gaps.
+    """The order of the chain over all topics, and gaps within a topic.
+
+    DDS keeps the order within a topic. So a message that is ahead of the next one of its kind shows a loss, or is a
+    stranger's; it is refused, as nothing could fill the gap. A message that is refused in its turn leaves its place to
+    the next one of its sequence number.
 
     :ivar repeated_count: number of repeated messages, which are dropped.
-    :ivar fault: sentence about the first gap, None without.
     """
 
-    def __init__(self, message_types: Iterable[type], first_event: int = 0) -> None:
+    def __init__(
+        self,
+        message_types: Iterable[type],
+        first_event: int = 0,
+        is_admitted: Callable[[ChainMessage], bool] = lambda _: True,
+    ) -> None:
         """Start with a keyframe event.
 
         :param message_types: of the process; those outside the chain are ignored.
         :param first_event: number of the first keyframe event.
+        :param is_admitted: whether a message whose turn it is may be delivered.
         """
         message_types = tuple(message_types)
         self._kinds = tuple(kind for kind in CHAIN if kind in message_types)
-        self._waiting: dict[type, deque[ChainMessage]] = {kind: deque() for kind in self._kinds}
+        self._waiting: dict[type, dict[int, list[ChainMessage]]] = {kind: {} for kind in self._kinds}
         self._next_sequences = dict.fromkeys(self._kinds, first_event)
+        self._ahead: dict[type, list[int]] = {kind: [] for kind in self._kinds}
         self._delivered_count = first_event * len(self._kinds)
         self.repeated_count = 0
-        self.fault: str | None = None
+        self._is_admitted = is_admitted
+
+    @property
+    def fault(self) -> str | None:
+        """Sentence about a gap, None without.
+
+        Strangers are refused, and may be many; after a loss the next messages follow one on the other.
+        """
+        for kind, expected in self._next_sequences.items():
+            ahead = self._ahead[kind]
+            if len(ahead) == _GAP_MESSAGES and ahead[-1] - ahead[0] == _GAP_MESSAGES - 1:
+                return (
+                    f"{kind.__name__} {expected} never came, {ahead[0]} did: the node started too late "
+                    "or lost messages, restart all nodes"
+                )
+        return None
 
     @property
     def waiting_count(self) -> int:
         """Number of messages that wait for their turn."""
-        return sum(len(queue) for queue in self._waiting.values())
+        return sum(len(candidates) for queue in self._waiting.values() for candidates in queue.values())
 
     @property
     def events(self) -> int | None:
@@ -80,37 +103,65 @@ class ChainOrder:
         events, begun = divmod(self._delivered_count, len(self._kinds))
         return None if begun else events
 
-    def push(self, message: ChainMessage) -> list[ChainMessage]:
-        """Take a message; return those whose turn it is, in order."""
-        kind, sequence = type(message), message.sequence
-        if sequence < self._next_sequences[kind]:
-            self.repeated_count += 1
-            return []
-        if sequence > self._next_sequences[kind] and self.fault is None:
-            self.fault = (
-                f"{kind.__name__} {self._next_sequences[kind]} never came, {sequence} did: the node started too late "
-                "or lost messages, restart all nodes"
-            )
-        self._next_sequences[kind] = sequence + 1
-        self._waiting[kind].append(message)
-        return list(self._pop_due())
+    def push(self, message: ChainMessage) -> None:
+        """Take a message.
 
-    def _pop_due(self) -> Iterable[ChainMessage]:
+        :raises HmtSlamError: where it is ahead of the next one of its kind.
+        """
+        kind, sequence = type(message), message.sequence
+        expected, waiting = self._next_sequences[kind], self._waiting[kind]
+        if sequence > expected:
+            self._ahead[kind] = [*self._ahead[kind], sequence][-_GAP_MESSAGES:]
+            raise HmtSlamError(
+                f"{kind.__name__} {sequence} came before {expected}: the node started too late or lost messages, or a "
+                "second system speaks in this ROS domain"
+            )
+        candidates = waiting.get(sequence, [])
+        if sequence < expected:
+            self.repeated_count += 1
+        if sequence == expected or (candidates and len(candidates) < _MAX_CANDIDATES):
+            waiting.setdefault(sequence, []).append(message)
+        while self._next_sequences[kind] in waiting:
+            self._next_sequences[kind] += 1
+            self._ahead[kind] = []
+
+    def pop_due(self) -> Iterator[ChainMessage]:
+        """The messages whose turn it is, in order; each is admitted when the one before was handled."""
         while True:
             sequence, turn = divmod(self._delivered_count, len(self._kinds))
-            queue = self._waiting[self._kinds[turn]]
-            if not queue or queue[0].sequence != sequence:
+            kind = self._kinds[turn]
+            candidates = self._waiting[kind].pop(sequence, [])
+            message = next(filter(self._is_admitted, candidates), None)
+            if message is None:
+                if candidates:
+                    self.reopen(kind, sequence)
                 return
             self._delivered_count += 1
-            yield queue.popleft()
+            yield message
+
+    def reopen(self, kind: type, sequence: int) -> None:
+        """Accept another message in the place of one that was refused."""
+        self._next_sequences[kind] = sequence
+
+    def withdraw(self, message: ChainMessage) -> None:
+        """Take back the last message that was delivered."""
+        self._delivered_count -= 1
+        self.reopen(type(message), message.sequence)
 
 
+_MAX_CANDIDATES = 4
+"""Messages of one kind and sequence number that are kept, in case the first one is refused."""
+_GAP_MESSAGES = 3
+"""Messages that follow each other beyond a gap, by which it is known for one."""
+_MAX_EARLY = 10_000
+"""Messages of after a reset that are kept until this node makes it, and unmatched halves of keyframes."""
 _HELD = "kept until it is active"
 
 
 class Inbox:
     """Subscriptions of a node to messages of the processes.
 
+    :ivar gate: checks of the chain.
     :ivar order: order of the chain, with its complete events and its first gap.
     :ivar final_counts: the counts that slam sends at the end, None before.
     :ivar is_holding: whether messages are kept instead of delivered.
@@ -118,7 +169,7 @@ class Inbox:
 
     def __init__(
         self,
-        node: Node,
+        node: GuardedNode,
         message_types: Iterable[type],
         deliver: Callable[[Message], None],
         diagnostics: NodeDiagnostics,
@@ -126,6 +177,7 @@ class Inbox:
         first_event: int = 0,
         reset_number: int | None = None,
         resume_stamps: Mapping[str, int] | None = None,
+        gate: ChainGate | None = None,
     ) -> None:
         """Subscribe.
 
@@ -135,17 +187,19 @@ class Inbox:
         :param first_event: number of the first keyframe event.
         :param reset_number: number of the node's last reset, 0 before the first; None to accept messages of any.
         :param resume_stamps: {measurement type: stamp, ns} after which past ones are wanted too.
+        :param gate: with the hypotheses that are alive; without one they are not known yet.
         """
         self._resume_stamps, self._reset_number = resume_stamps or {}, reset_number
         self._early: list[tuple[int, Callable[[], None]]] = []
         self._message_types = message_types = tuple(message_types)
-        self._node, self._deliver, self._diagnostics = node, deliver, diagnostics
-        self.order = ChainOrder(message_types, first_event)
+        self._node, self._deliver, self._diagnostics, self._system = node, deliver, diagnostics, diagnostics.system
+        self.gate = gate or ChainGate()
+        self.order = ChainOrder(message_types, first_event, self._is_admitted)
         self._estimate_profile = estimate_profile
         self.is_holding = False
         self._held: deque[Message] = deque()
-        self._headers: deque[KeyframeHeader] = deque()
-        self._ranges: deque[tuple[int, Any]] = deque()
+        self._headers: dict[int, KeyframeHeader] = {}
+        self._ranges: dict[int, Any] = {}
         self.final_counts: FinalCounts | None = None
         self._odometry: SensorSubscription | None = None
         for kind in message_types:
@@ -167,13 +221,15 @@ class Inbox:
         while self._held:
             self.receive(self._held.popleft())
 
-    def reset(self, first_event: int, reset_number: int) -> None:
+    def reset(self, first_event: int, reset_number: int, gate: ChainGate | None = None) -> None:
         """Start the chain again, and drop what is kept.
 
         :param first_event: number of the first keyframe event.
         :param reset_number: number of the reset request.
+        :param gate: with the hypotheses that are alive; without one they are not known yet.
         """
-        self.order, self._reset_number = ChainOrder(self._message_types, first_event), reset_number
+        self.gate, self._reset_number = gate or ChainGate(), reset_number
+        self.order = ChainOrder(self._message_types, first_event, self._is_admitted)
         self._held.clear()
         self._headers.clear()
         self._ranges.clear()
@@ -188,17 +244,31 @@ class Inbox:
         """Take in what was sent after this node's last reset; keep what was sent after a later one, drop the rest."""
         if self._reset_number is None or reset_number == self._reset_number:
             take_in()
-        elif reset_number > self._reset_number:
+        elif reset_number > self._reset_number and len(self._early) < _MAX_EARLY:
             self._early.append((reset_number, take_in))
+
+    def withdraw(self, message: Message) -> None:
+        """Take back the last message that was delivered, which its process could not handle."""
+        if isinstance(message, CHAIN):
+            self.gate.withdraw()
+            self.order.withdraw(message)  # type: ignore[arg-type]
+
+    def _is_admitted(self, message: ChainMessage) -> bool:
+        """Whether a message whose turn it is fits to the hypotheses that are alive; else it is reported."""
+        try:
+            self.gate.check(message)
+        except HmtSlamError as fault:
+            self._diagnostics.refuse(DOCUMENTS.get(type(message), KEYFRAMES), fault)
+            return False
+        self.gate.note(message)
+        return True
 
     def _subscribe_to(self, kind: type) -> None:
         if kind is Keyframe:
             self._subscribe(LaserScan, KEYFRAME_SCANS, self._on_ranges)
             self._subscribe(String, KEYFRAMES, self._on_keyframe_header)
         elif kind is ScanPoses:
-            self._subscribe(
-                Path, SCAN_POSES, lambda message: self.receive(conversions.scan_poses_from_message(message))
-            )
+            self._subscribe(Path, SCAN_POSES, self._on_scan_poses)
         elif kind is EndOfRun:
             self._subscribe(String, FINISHED, self._on_final_counts)
         elif kind is Odometry:
@@ -207,7 +277,8 @@ class Inbox:
                 self._diagnostics,
                 OdometryMessage,
                 ODOM,
-                lambda message: self.receive(conversions.odometry_from_message(message)),
+                conversions.odometry_from_message,
+                self.receive,
                 self._resume_stamps.get("Odometry"),
             )
             self._odometry.start()
@@ -218,51 +289,46 @@ class Inbox:
     def _subscribe(
         self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile = topics.CHAIN
     ) -> None:
-        def guarded_callback(message: object) -> None:
-            try:
-                callback(message)
-            except HmtSlamError as fault:
-                self._diagnostics.fail(f"{topic}: {fault}")
+        self._node.create_subscription(kind, topic, callback, profile)
 
-        self._node.create_subscription(kind, topic, guarded_callback, profile)
+    def _on_scan_poses(self, message: Path) -> None:
+        self.receive(conversions.scan_poses_from_message(message, self._system.admit))
 
     def _on_document(self, message: String, kind: type[Any]) -> None:
-        document, reset_number = decode_with_reset(message.data, kind)
+        document, reset_number = decode_checked(message.data, kind, self._system)
         self._match_reset(reset_number, lambda: self.receive(document))
 
     def _on_keyframe_header(self, message: String) -> None:
-        header, reset_number = decode_with_reset(message.data, KeyframeHeader)
+        header, reset_number = decode_checked(message.data, KeyframeHeader, self._system)
 
         def take_in() -> None:
-            self._headers.append(header)
-            self._join_keyframes()
+            _keep(self._headers, header.sequence, header)
+            self._join_keyframe(header.sequence)
 
         self._match_reset(reset_number, take_in)
 
     def _on_ranges(self, message: LaserScan) -> None:
-        sequence, reset_number = conversions.keyframe_from_frame(message.header.frame_id)
+        sequence, reset_number, system = conversions.keyframe_from_frame(message.header.frame_id)
+        self._system.admit(system)
         ranges = conversions.ranges_from_message(message)
 
         def take_in() -> None:
-            self._ranges.append((sequence, ranges))
-            self._join_keyframes()
+            _keep(self._ranges, sequence, ranges)
+            self._join_keyframe(sequence)
 
         self._match_reset(reset_number, take_in)
 
-    def _join_keyframes(self) -> None:
-        """Deliver keyframes whose header and ranges are here; a lost half becomes a gap in the chain."""
-        while self._headers and self._ranges:
-            header, (sequence, ranges) = self._headers[0], self._ranges[0]
-            if header.sequence <= sequence:
-                self._headers.popleft()
-            if sequence <= header.sequence:
-                self._ranges.popleft()
-            if header.sequence == sequence:
-                self.receive(header.to_keyframe(ranges))
+    def _join_keyframe(self, sequence: int) -> None:
+        """Deliver a keyframe whose header and ranges are here; a lost half becomes a gap in the chain."""
+        if sequence in self._headers and sequence in self._ranges:
+            keyframe = self._headers.pop(sequence).to_keyframe(self._ranges.pop(sequence))
+            check_message(keyframe)
+            self.receive(keyframe)
 
     def _on_final_counts(self, message: String) -> None:
-        self.final_counts = decode(message.data, FinalCounts)
-        self.receive(self.final_counts.totals)
+        final_counts, _ = decode_checked(message.data, FinalCounts, self._system)
+        self.final_counts = final_counts
+        self.receive(final_counts.totals)
 
     def receive(self, message: Message) -> None:
         """Count a message and deliver those whose turn it is, or keep it while the inbox is holding."""
@@ -276,28 +342,60 @@ class Inbox:
         if not isinstance(message, CHAIN):
             self._deliver(message)
             return
-        for due in self.order.push(message):  # type: ignore[arg-type]
+        order = self.order
+        try:
+            order.push(message)  # type: ignore[arg-type]
+        finally:
+            if order.fault is not None:
+                self._diagnostics.fail(order.fault)
+        for due in order.pop_due():
             self._deliver(due)
         self._diagnostics.values["waiting for their turn"] = self.order.waiting_count
         self._diagnostics.values["repeated"] = self.order.repeated_count
-        if self.order.fault is not None:
-            self._diagnostics.fail(self.order.fault)
+
+
+def _keep(halves: dict[int, Any], sequence: int, half: Any) -> None:  # noqa: ANN401  header or ranges
+    """Keep a half of a keyframe; of too many, the oldest is dropped."""
+    halves[sequence] = half
+    if len(halves) > _MAX_EARLY:
+        del halves[next(iter(halves))]
 
 
 def subscribe_document(
-    node: Node, diagnostics: NodeDiagnostics, kind: type[Any], callback: Callable[[Any], None], profile: QoSProfile
+    node: GuardedNode,
+    kind: type[Any],
+    callback: Callable[[Any], None],
+    profile: QoSProfile,
+    *,
+    may_be_unnamed: bool = False,
 ) -> None:
-    """Subscribe to a type of documents; one that cannot be decoded is a fault in the diagnostics."""
+    """Subscribe to a type of documents; parameters are those of :func:`document_callback`."""
+    on_document = document_callback(node.diagnostics, kind, callback, may_be_unnamed=may_be_unnamed)
+    node.create_subscription(String, DOCUMENTS[kind], on_document, profile)
+
+
+def document_callback(
+    diagnostics: NodeDiagnostics, kind: type[Any], callback: Callable[[Any], None], *, may_be_unnamed: bool = False
+) -> Callable[[String], None]:
+    """Callback of a subscription to a type of documents.
+
+    It raises an error for one that is malformed, of another system or makes no sense.
+
+    :param callback: called with each document.
+    :param may_be_unnamed: whether senders may not know yet which system they belong to; until then they are ignored.
+    """
 
     def on_document(message: String) -> None:
         try:
-            document = decode(message.data, kind)
-        except HmtSlamError as fault:
-            diagnostics.fail(f"{DOCUMENTS[kind]}: {fault}")
+            document, _ = decode_checked(message.data, kind, diagnostics.system)
+        except ForeignDocumentError as fault:
+            if fault.system or not may_be_unnamed:
+                raise
+            diagnostics.count_refused(DOCUMENTS[kind])
         else:
             callback(document)
 
-    node.create_subscription(String, DOCUMENTS[kind], on_document, profile)
+    return on_document
 
 
 Writer = Callable[[Any], None]
@@ -314,9 +412,9 @@ class Outbox:
     :ivar reset_number: number of the node's last reset, 0 before the first.
     """
 
-    def __init__(self, node: Node, message_types: Iterable[type], reset_number: int = 0) -> None:
+    def __init__(self, node: GuardedNode, message_types: Iterable[type], reset_number: int = 0) -> None:
         """Make the publishers."""
-        self._node = node
+        self._node, self._system = node, node.diagnostics.system
         self.reset_number = reset_number
         self.sent = dict.fromkeys((kind.__name__ for kind in _COUNTED), 0)
         self._writers: dict[type, Writer] = {
@@ -341,41 +439,29 @@ class Outbox:
         if kind is Keyframe:
             return self._keyframe_writer()
         if kind is ScanPoses:
-            paths = self._node.create_publisher(Path, SCAN_POSES, topics.CHAIN)
-            return lambda scan_poses: publish_reliably(paths, conversions.path_message(scan_poses))
+            paths = ChainWriter(self._node, Path, SCAN_POSES, topics.CHAIN_HISTORY)
+            return lambda scan_poses: paths.publish(conversions.path_message(scan_poses, self._system.name))
         if kind is EndOfRun:
-            finals = self._node.create_publisher(String, FINISHED, topics.CHAIN)
-            return lambda totals: publish_reliably(finals, String(data=encode(self._final_counts(totals))))
-        documents = self._node.create_publisher(String, DOCUMENTS[kind], topics.CHAIN)
-        return lambda message: publish_reliably(documents, String(data=encode(message, self.reset_number)))
+            finals = ChainWriter(self._node, String, FINISHED, topics.CHAIN_HISTORY)
+            return lambda totals: finals.publish(self._document(self._final_counts(totals)))
+        profile = topics.ESTIMATE_HISTORY if kind is LocalEstimate else topics.CHAIN_HISTORY
+        documents = ChainWriter(self._node, String, DOCUMENTS[kind], profile)
+        return lambda message: documents.publish(self._document(message))
+
+    def _document(self, message: object) -> String:
+        return String(data=encode(message, self.reset_number, self._system.name))
 
     def _keyframe_writer(self) -> Writer:
-        scans = self._node.create_publisher(LaserScan, KEYFRAME_SCANS, topics.CHAIN)
-        headers = self._node.create_publisher(String, KEYFRAMES, topics.CHAIN)
+        scans = ChainWriter(self._node, LaserScan, KEYFRAME_SCANS, topics.CHAIN_HISTORY)
+        headers = ChainWriter(self._node, String, KEYFRAMES, topics.CHAIN_HISTORY)
 
         def write(keyframe: Keyframe) -> None:
-            frame = conversions.keyframe_frame(keyframe.sequence, self.reset_number)
-            publish_reliably(scans, conversions.scan_message(keyframe.scan, frame))
-            publish_reliably(headers, String(data=encode(KeyframeHeader.from_keyframe(keyframe), self.reset_number)))
+            frame = conversions.keyframe_frame(keyframe.sequence, self.reset_number, self._system.name)
+            scans.publish(conversions.scan_message(keyframe.scan, frame))
+            headers.publish(self._document(KeyframeHeader.from_keyframe(keyframe)))
 
         return write
 
     def _final_counts(self, totals: EndOfRun) -> FinalCounts:
         keyframes, scan_poses = (self.sent[kind.__name__] for kind in _COUNTED)
         return FinalCounts(totals, keyframes, scan_poses)
-
-
-def publish_reliably(publisher: Any, message: Any) -> None:  # noqa: ANN401  any ROS message
-    """Publish; where a reader lags by a whole history, wait until it has caught up or is gone.
-
-    :raises ExternalShutdownException: where the node is to shut down meanwhile.
-    """
-    while True:
-        try:
-            publisher.publish(message)
-        except RCLError:
-            # DDS itself waits 0.1 s for room.
-            if not rclpy.ok():
-                raise ExternalShutdownException from None
-        else:
-            return

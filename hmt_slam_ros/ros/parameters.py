@@ -13,6 +13,8 @@ from rclpy.parameter import Parameter
 
 from hmt_slam_ros.configuration import Configuration, FlatParameter, flat_parameters, with_changes
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.messages.system_name import SystemName
+from hmt_slam_ros.ros.guarded_node import GuardedNode
 
 # Parameters of nodes that the configuration tree does not have.
 _NODE_PARAMETERS = (
@@ -25,15 +27,17 @@ _NODE_PARAMETERS = (
     "initial_pose",
     "recovery",
     "autostart",
+    "system",
 )
 _ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 
-class ConfiguredNode(Node):
+class ConfiguredNode(GuardedNode):
     """A node that has every parameter of the configuration tree as a ROS parameter.
 
     :cvar changeable_parameters: dotted names of the parameters that may change while the node runs.
     :ivar configuration: the tree with the current values.
+    :ivar system: the system that the node belongs to.
     """
 
     changeable_parameters: tuple[str, ...] = ()
@@ -44,6 +48,7 @@ class ConfiguredNode(Node):
         :raises HmtSlamError: for an invalid value, or an unknown name, which ROS would ignore.
         """
         super().__init__(name, **options)
+        self.system = declare_system(self)
         # rclpy has no public list of the overrides.
         self.configuration = _with_values(Configuration(), self._parameter_overrides.values())
         for parameter in flat_parameters(self.configuration):
@@ -111,6 +116,19 @@ def _descriptor(parameter: FlatParameter) -> ParameterDescriptor:
         else:
             descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
     return descriptor
+
+
+def declare_system(node: Node) -> SystemName:
+    """Declare ``system``, and return the system that the node belongs to.
+
+    :raises HmtSlamError: where it is no name.
+    """
+    descriptor = ParameterDescriptor(
+        description="Name of the system of nodes that this one belongs to; messages of another one are left out. Empty "
+        "for that of the first message that has one.",
+        read_only=True,
+    )
+    return SystemName(str(node.declare_parameter("system", "", descriptor).value))
 
 
 def declare_frame(node: Node, which: str, default: str) -> str:

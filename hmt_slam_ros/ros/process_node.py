@@ -5,30 +5,32 @@ from __future__ import annotations
 import json
 import signal
 import time
+import traceback
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
 from rclpy.signals import uninstall_signal_handlers
-from std_msgs.msg import String
 
 from hmt_slam_ros.compilation import report_compilation
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import as_flat
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.messages.documents import ResetRequest, ResetResponse, SaveRequest, SaveResponse, encode
+from hmt_slam_ros.messages.gate import ChainGate
 from hmt_slam_ros.messages.messages import Message, Notice, RealTimePose, TrackingReset
+from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS
 from hmt_slam_ros.messages.routing import SUBSCRIPTIONS, Checkpointable, message_types
 from hmt_slam_ros.process_table import participant_names, process_row
-from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.execution import force_exit_after, spin_until
 from hmt_slam_ros.ros.initial_state import InitialState, declare_start_from, declare_start_lost
-from hmt_slam_ros.ros.lifecycle import ManagedNode
-from hmt_slam_ros.ros.message_io import CHAIN, Inbox, Outbox, subscribe_document
+from hmt_slam_ros.ros.journal import UnreadableInput
+from hmt_slam_ros.ros.message_io import Inbox, Outbox
+from hmt_slam_ros.ros.publisher_monitor import PublisherMonitor
 from hmt_slam_ros.ros.recovery import (
     ActivationChange,
     ControlEvent,
@@ -38,20 +40,24 @@ from hmt_slam_ros.ros.recovery import (
     Recovery,
     declare_recovery,
 )
-from hmt_slam_ros.ros.topics import DOCUMENTS
-from hmt_slam_ros.saved_map.folder import FileRecord, FolderWriter
+from hmt_slam_ros.ros.request_participant import ParticipantNode, RequestParticipant
+from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors.plausibility import check_odometry, check_scan
+from hmt_slam_ros.untrusted_input import shorten
 
 SAVE_TIMEOUT = 8.0
 """Time for the last save, s: launch sends SIGTERM 5 s after SIGINT, and SIGKILL 5 s later."""
 _LINGER = 0.5
 """Time from a node's part of the last save to its end, s, in which DDS delivers the response."""
 _POLL = 0.05  # s
+_MAX_REBUILDS, _REBUILD_WINDOW = 3, 60.0
+"""Most rebuilds of a process within this many seconds."""
 _SAVE_ON_SHUTDOWN = ParameterDescriptor(
     description="Whether all nodes save the map to save_to of slam when they are told to end.", read_only=True
 )
 
 
-class ProcessNode(ManagedNode):
+class ProcessNode(ParticipantNode):
     """Node of a process of the process table, with the same name.
 
     :cvar is_always_listening: whether the process also gets messages while the node is inactive.
@@ -123,7 +129,9 @@ class ProcessNode(ManagedNode):
             self.initial_state = InitialState(self, self.start_from, lost=self._start_lost)
         else:
             self.initial_state = self._recovered_initial_state(recovered)
-        self.process = self._create_process()
+        self._replayed: list[Message | ControlEvent | UnreadableInput] = []
+        self._rebuild_times: deque[float] = deque(maxlen=_MAX_REBUILDS)
+        self.process = self._create_process(self.initial_state)
         if recovered is None:
             self._start_journal()
         report_compilation(self.get_logger().info)
@@ -136,7 +144,9 @@ class ProcessNode(ManagedNode):
             first_event=self.initial_state.events,
             reset_number=self.reset_number,
             resume_stamps=self.resume_stamps,
+            gate=_gate(self.initial_state),
         )
+        self._publisher_monitor = PublisherMonitor(self, self.diagnostics, self._name)
         self._participant = RequestParticipant(self, self._name) if self._name in participant_names() else None
 
     def activate_node(self) -> None:
@@ -190,23 +200,21 @@ class ProcessNode(ManagedNode):
         process: Checkpointable = row.make(self.configuration, initial_state.read_part(self._name, row.state_class))
         return process
 
-    def _create_process(self) -> Checkpointable:
-        process = self.make_process(self.initial_state)
-        if self.initial_state.lost and TrackingReset in SUBSCRIPTIONS[self._name]:
+    def _create_process(self, initial_state: InitialState) -> Checkpointable:
+        process = self.make_process(initial_state)
+        if initial_state.lost and TrackingReset in SUBSCRIPTIONS[self._name]:
             # The one that slam sends may come after this node's first output.
-            process.handle(TrackingReset(self.initial_state.events, 0))
+            process.handle(TrackingReset(initial_state.events, 0))
         return process
 
     def reset(self, folder: str, reset_number: int = 0) -> None:
-        """Forget all, and start again with a map in which the robot may be anywhere, or with nothing.
+        """As its requests need it; also start a new journal.
 
-        :param folder: of the map, empty for nothing.
-        :param reset_number: number of the reset request.
         :raises HmtSlamError: for a map that is damaged or does not match.
         """
         self.initial_state = InitialState(self, folder, lost=True, previous_scans=self.scans)
-        self.process = self._create_process()
-        self.inbox.reset(self.initial_state.events, reset_number)
+        self.process = self._create_process(self.initial_state)
+        self.inbox.reset(self.initial_state.events, reset_number, _gate(self.initial_state))
         self.reset_number = self.outbox.reset_number = reset_number
         self._start_journal()
 
@@ -228,9 +236,13 @@ class ProcessNode(ManagedNode):
         )
 
     def _recovered_initial_state(self, recovered: RecoveredState) -> InitialState:
+        self.reset_number = recovered.header.reset_number
+        self.diagnostics.received.update(recovered.header.received)
+        return self._journal_initial_state(recovered)
+
+    def _journal_initial_state(self, recovered: RecoveredState) -> InitialState:
+        """State of the process at the start of a journal."""
         header = recovered.header
-        self.reset_number = header.reset_number
-        self.diagnostics.received.update(header.received)
         if header.has_checkpoint:
             return InitialState.from_checkpoint(self, recovered.checkpoint_folder, header)
         return InitialState(self, header.folder, lost=header.lost, previous_scans=header.previous_scans)
@@ -256,9 +268,15 @@ class ProcessNode(ManagedNode):
         for message in recovered.outputs:
             self.outbox.resend(message)
         for value in recovered.inputs:
-            self.replay_input(value)
+            try:
+                self.replay_input(_checked_input(value))
+            except HmtSlamError as fault:
+                self.diagnostics.refuse("the journal", fault)
+                self.recovery.require_checkpoint()
         self.is_recovering = False
+        self._replayed.clear()
         self.recovery.resume_journal()
+        self._write_due_checkpoint()
         self.get_logger().warning(
             f"{self._name} was killed and goes on where it was: at keyframe event {recovered.header.events} and "
             f"{len(recovered.inputs)} messages, {time.monotonic() - begin:.1f} s"
@@ -267,6 +285,7 @@ class ProcessNode(ManagedNode):
     def replay_input(self, value: Message | ControlEvent) -> None:
         """Handle an input from the journal."""
         if isinstance(value, ParameterChange):
+            self._replayed.append(value)
             self.set_parameters([Parameter(value.name, value=json.loads(value.value))])
         elif not isinstance(value, ControlEvent):
             self.inbox.receive(value)
@@ -299,16 +318,88 @@ class ProcessNode(ManagedNode):
             return
         self.recovery.record_input(message)
         outputs: list[Message] = []
+        try:
+            self._handle(message, outputs)
+        except Exception as fault:
+            self._set_aside(message, fault)
+            return
+        self._publish_all(message, outputs)
+        if self.is_recovering:
+            self._replayed.append(message)
+        if self._participant is not None:
+            self._participant.on_delivered(message)
+        self._write_due_checkpoint()
+
+    def _handle(self, message: Message, outputs: list[Message]) -> None:
         begin = time.perf_counter()
         with self.diagnostics.measure(message, outputs):
             outputs += self.process.handle(message)
         self.recovery.add_busy_time(time.perf_counter() - begin)
-        for output in outputs:
-            self._publish_output(output)
-        self.publish_views(message, outputs)
-        if self._participant is not None:
-            self._participant.on_delivered(message)
-        self._write_due_checkpoint()
+
+    def _publish_all(self, message: Message, outputs: list[Message]) -> None:
+        """Publish outputs and views; a fault in that changes nothing in the process."""
+        try:
+            for output in outputs:
+                self.inbox.gate.note(output)
+                self._publish_output(output)
+            self.publish_views(message, outputs)
+        except ExternalShutdownException:
+            raise
+        except Exception as fault:
+            if not rclpy.ok():
+                raise
+            self.get_logger().error("".join(traceback.format_exception(fault)))
+            self.diagnostics.warn(
+                f"{self._name} could not publish all that follows from a {type(message).__name__} "
+                f"({shorten(repr(fault))}): report the fault with the log"
+            )
+
+    def _set_aside(self, message: Message, fault: Exception) -> None:
+        """Go on without a message that the process could not handle: rebuild the process as it was before it."""
+        kind = type(message).__name__
+        kept = self.recovery.quarantine(message)
+        self.get_logger().error("".join(traceback.format_exception(fault)))
+        self.diagnostics.count_refused(f"{kind}, set aside")
+        self.diagnostics.warn(
+            f"{self._name} could not handle a {kind} ({shorten(repr(fault))}) and goes on without it: report the fault "
+            f"with {kept or 'the log'}"
+        )
+        try:
+            recovered = self.recovery.recovered_state if self.is_recovering else self.recovery.withdraw_input()
+            if recovered is not None:
+                self._check_rebuild_budget()
+                self.process = self._rebuilt_process(recovered, self._replayed if self.is_recovering else None)
+        except Exception as error:
+            self.diagnostics.warn(
+                f"{self._name} could not be rebuilt ({shorten(repr(error))}) and goes on as it is: restart all nodes"
+            )
+        self.recovery.require_checkpoint()
+        self.inbox.withdraw(message)
+
+    def _check_rebuild_budget(self) -> None:
+        """Count a rebuild, which takes as long as all since the last checkpoint.
+
+        :raises HmtSlamError: where there were too many lately.
+        """
+        now = time.monotonic()
+        if len(self._rebuild_times) == _MAX_REBUILDS and now - self._rebuild_times[0] < _REBUILD_WINDOW:
+            raise HmtSlamError(f"{_MAX_REBUILDS} rebuilds within {_REBUILD_WINDOW:g} s are the most")
+        self._rebuild_times.append(now)
+
+    def _rebuilt_process(
+        self, recovered: RecoveredState, inputs: Sequence[Message | ControlEvent | UnreadableInput] | None
+    ) -> Checkpointable:
+        """The process after some inputs; its outputs were published before.
+
+        :param inputs: None for those of the journal.
+        """
+        process = self._create_process(self._journal_initial_state(recovered))
+        for value in recovered.inputs if inputs is None else inputs:
+            if isinstance(value, ParameterChange) and hasattr(process, value.name):
+                setattr(process, value.name, json.loads(value.value))
+            elif not isinstance(value, ControlEvent | UnreadableInput):
+                process.handle(value)
+        return process
 
     def _publish_output(self, output: Message) -> None:
         if isinstance(output, RealTimePose) and not self.is_active:
@@ -356,6 +447,25 @@ class ProcessNode(ManagedNode):
         """Publish what people see after a message and its outputs; by default nothing."""
 
 
+def _gate(initial_state: InitialState) -> ChainGate:
+    """The gate of a process in an initial state; the hypotheses of a map or checkpoint are not known to it."""
+    return ChainGate(None if initial_state.events else (FIRST_HYPOTHESIS,))
+
+
+def _checked_input(value: Message | ControlEvent | UnreadableInput) -> Message | ControlEvent:
+    """An input of a journal.
+
+    :raises HmtSlamError: where it could not be read, or is a measurement that is none.
+    """
+    if isinstance(value, UnreadableInput):
+        raise HmtSlamError(value.fault)
+    if isinstance(value, Scan):
+        check_scan(value)
+    elif isinstance(value, Odometry):
+        check_odometry(value)
+    return value
+
+
 class _FirstSignal:
     """Handler of SIGINT and SIGTERM in place of rclpy's; later signals are ignored.
 
@@ -377,89 +487,3 @@ class _FirstSignal:
         if self.received_at is None:
             self.received_at = time.monotonic()
             force_exit_after(SAVE_TIMEOUT + 1.0, 0)
-
-
-class RequestParticipant:
-    """Answers the coordinated requests of slam, each after the keyframe event that it names."""
-
-    def __init__(self, node: ProcessNode, name: str) -> None:
-        """Subscribe to the requests; ``name`` is that of the process."""
-        self._node, self._name = node, name
-        self._last_event_type = [kind for kind in CHAIN if kind in SUBSCRIPTIONS[name]][-1]
-        self._events = node.initial_state.events
-        self._requests: deque[SaveRequest | ResetRequest] = deque()
-        self._final_part_saved_at: float | None = None
-        self._responses = {
-            kind: node.create_publisher(String, DOCUMENTS[kind], topics.CHAIN) for kind in (SaveResponse, ResetResponse)
-        }
-        # A late node has to follow a reset too.
-        for kind, profile in ((SaveRequest, topics.VOLATILE_CHAIN), (ResetRequest, topics.CHAIN)):
-            subscribe_document(node, node.diagnostics, kind, self._on_request, profile)
-
-    def _on_request(self, request: SaveRequest | ResetRequest) -> None:
-        """Take a request, unless it is a reset that was answered before."""
-        if isinstance(request, SaveRequest) or request.number > self._node.reset_number:
-            self._requests.append(request)
-            self.answer_due_requests()
-
-    def on_delivered(self, message: Message) -> None:
-        """Count keyframe events, and answer the requests that wait for this one."""
-        if isinstance(message, self._last_event_type):
-            self._events += 1
-            self.answer_due_requests()
-
-    def has_saved_final_part(self, linger: float) -> bool:
-        """Whether the part of the last map was saved ``linger`` s ago, or there is nothing to save."""
-        return not self._events or (
-            self._final_part_saved_at is not None and time.monotonic() - self._final_part_saved_at >= linger
-        )
-
-    def answer_due_requests(self) -> None:
-        """Answer requests whose keyframe event has come; those of a holding inbox too, for which it never will."""
-        while self._requests and (self._events >= self._requests[0].events or self._node.inbox.is_holding):
-            self._answer(self._requests.popleft())
-
-    def _answer(self, request: SaveRequest | ResetRequest) -> None:
-        fault = self._event_mismatch(request)
-        if isinstance(request, ResetRequest):
-            self._respond(ResetResponse(request.number, self._name, fault or self._reset(request)))
-            self._node.inbox.deliver_early()
-            return
-        files: tuple[FileRecord, ...] = ()
-        if not fault:
-            files, fault = self._write_part(request)
-        self._respond(SaveResponse(request.number, self._name, files, fault))
-        if request.shutdown:
-            self._final_part_saved_at = time.monotonic()
-
-    def _respond(self, response: SaveResponse | ResetResponse) -> None:
-        self._responses[type(response)].publish(String(data=encode(response)))
-
-    def _event_mismatch(self, request: SaveRequest | ResetRequest) -> str:
-        """Fault where the process is at another keyframe event; a reset may come after fewer."""
-        if self._events > request.events:
-            return f"it is at keyframe event {self._events}, not {request.events}: restart all nodes"
-        if self._events < request.events and isinstance(request, SaveRequest):
-            return f"it is inactive, at keyframe event {self._events} of {request.events}: activate it"
-        return ""
-
-    def _reset(self, request: ResetRequest) -> str:
-        """Reset the node; return the fault, if any."""
-        try:
-            self._node.reset(request.folder, request.number)
-        except HmtSlamError as fault:
-            return f"{fault}; restart all nodes"
-        self._events = self._node.initial_state.events
-        return ""
-
-    def _write_part(self, request: SaveRequest) -> tuple[tuple[FileRecord, ...], str]:
-        """Write the node's part of the map; return its files, or the fault."""
-        folder = Path(request.folder)
-        if not folder.is_dir():
-            return (), f"it does not see the folder {folder}: run all nodes where that is, or set save_to of slam"
-        try:
-            writer = FolderWriter(folder)
-            writer.write(self._name, self._node.process.state)
-        except OSError as error:
-            return (), f"{folder} cannot be written ({error.strerror})"
-        return writer.files, ""

@@ -4,22 +4,19 @@ A process is a value machine: the same state and the same inputs in the same ord
 a node writes every input to the journal before its process handles it, and at times the state of its process. Its
 successor, of the same name and folder, starts with that state and handles the inputs again. What it sends again the
 others recognize by sequence numbers. docs/decisions/0033-journal-recovery.md has the reasons.
-
-Each value is a line of JSON that names its type. Arrays are in a file beside it, written before the line. An incomplete
-last line is ignored. Nothing is flushed to the disk, since the system keeps what a killed process has written.
 """
 
 from __future__ import annotations
 
-import json
+import math
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,77 +26,20 @@ from rclpy.node import Node
 from hmt_slam_ros.configuration.documents import ros_yaml
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import Message, RealTimePose, TrackingReset
-from hmt_slam_ros.plain_data import PlainDataReader, to_plain
+from hmt_slam_ros.ros.journal import (
+    HEADER,
+    INPUT,
+    LINES,
+    OUTPUT,
+    Journal,
+    JournalEntry,
+    UnreadableInput,
+    is_in_use,
+    read_journal,
+)
 from hmt_slam_ros.ros.lifecycle import ManagedNode
-from hmt_slam_ros.saved_map.arrays import ArrayReader, ArrayWriter
 from hmt_slam_ros.saved_map.folder import CONFIGURATION, VERSION, FolderWriter
 from hmt_slam_ros.sensors import Odometry, Scan
-
-_LINES, _ARRAYS = "jsonl", "bin"
-_FORMAT_DOC = "docs/decisions/0033-journal-recovery.md"
-
-
-class JournalEntry(NamedTuple):
-    """A value in a journal with its role: header, output or input."""
-
-    role: str
-    value: object
-
-
-class Journal:
-    """Writer of a journal, the files ``<stem>.jsonl`` and ``<stem>.bin``.
-
-    :ivar size: bytes written.
-    """
-
-    def __init__(self, folder: Path, stem: str) -> None:
-        """Create the files.
-
-        :raises OSError: where that fails.
-        """
-        self.size = 0
-        self._lines = (folder / f"{stem}.{_LINES}").open("xb", buffering=0)
-        self._bytes = (folder / f"{stem}.{_ARRAYS}").open("xb")
-        self._arrays = ArrayWriter(self._bytes)
-
-    def append(self, role: str, value: object) -> None:
-        """Write a value.
-
-        :raises OSError: where that fails.
-        """
-        content = to_plain(value, {np.ndarray: self._arrays.store})
-        self._bytes.flush()
-        entry = {"role": role, "kind": type(value).__name__, "value": content}
-        line = json.dumps(entry, separators=(",", ":")).encode() + b"\n"
-        if self._lines.write(line) != len(line):
-            raise OSError(0, "the disk is full")
-        self.size = self._bytes.tell() + self._lines.tell()
-
-    def close(self) -> None:
-        """Close the files."""
-        self._lines.close()
-        with suppress(OSError):  # a full disk refused bytes that no line refers to
-            self._bytes.close()
-
-
-def read_journal(folder: Path, stem: str, kinds: Mapping[str, type]) -> Iterator[JournalEntry]:
-    """The values of a journal in their order.
-
-    :param kinds: {name: type} of the allowed values.
-    :raises HmtSlamError: where the journal is damaged.
-    """
-    arrays = ArrayReader((folder / f"{stem}.{_ARRAYS}").read_bytes())
-    values = PlainDataReader(_FORMAT_DOC, {np.ndarray: arrays.reader})
-    content = (folder / f"{stem}.{_LINES}").read_bytes()
-    for number, line in enumerate(content.split(b"\n")[:-1]):
-        path = f"{folder / stem}.{_LINES}[{number}]"
-        try:
-            entry = json.loads(line)
-            role, kind = entry["role"], kinds[entry["kind"]]
-        except (ValueError, KeyError) as fault:
-            raise HmtSlamError(f"{path} is damaged ({fault}): remove {folder.parent}, and restart all nodes") from fault
-        yield JournalEntry(role, values.read(entry["value"], kind, path))
-
 
 CHECKPOINT = "hmt_checkpoint"
 """Format of the folder of a checkpoint."""
@@ -115,8 +55,11 @@ _MAX_JOURNAL_SIZE = 64_000_000
 """Size of a journal above which a checkpoint is due, bytes; for a robot that stands still."""
 _RESENT_MESSAGES = 64
 """Outputs that are sent again, as they may not have reached the others; more than DDS has under way at any time."""
-_HEADER, _OUTPUT, _INPUT = "base", "said", "heard"
 _STATE, _PARTIAL = "state", ".partial"
+_QUARANTINE = ".quarantine"
+"""Suffix of the folder with the messages that a process could not handle."""
+_MAX_QUARANTINED = 100
+"""Messages that are kept there; more are only counted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +126,11 @@ class FrameMounting:
     angle_sign: float
 
 
+@dataclass(frozen=True)
+class Withdrawal:
+    """The input before this one is withdrawn: its process could not handle it."""
+
+
 ControlEvent = ParameterChange | PauseChange | ActivationChange | FrameMounting
 """An input beside messages, which holds until the next one of its kind."""
 
@@ -201,13 +149,36 @@ class RecoveredState:
     header: JournalHeader
     checkpoint_folder: Path
     outputs: list[Message]
-    inputs: list[Message | ControlEvent]
+    inputs: list[Message | ControlEvent | UnreadableInput]
     was_active: bool | None
 
 
 _JOURNAL_TYPES: dict[str, type] = {
-    kind.__name__: kind for kind in (JournalHeader, *get_args(ControlEvent), *get_args(Message))
+    kind.__name__: kind for kind in (JournalHeader, Withdrawal, *get_args(ControlEvent), *get_args(Message))
 }
+
+
+def _read_generation(folder: Path) -> tuple[JournalHeader, list[JournalEntry]]:
+    """The header and all entries of a generation.
+
+    :raises HmtSlamError: where a journal is damaged.
+    """
+    segments = len(list(folder.glob(f"*.{LINES}")))
+    entries = [entry for number in range(segments) for entry in read_journal(folder, str(number), _JOURNAL_TYPES)]
+    if not entries or not isinstance(entries[0].value, JournalHeader):
+        raise HmtSlamError(f"{folder} has no journal: remove {folder.parent}, and restart all nodes")
+    return entries[0].value, entries
+
+
+def _valid_inputs(entries: Iterable[JournalEntry]) -> list[Message | ControlEvent | UnreadableInput]:
+    """The inputs that were not withdrawn, in their order."""
+    inputs: list[Message | ControlEvent | UnreadableInput] = []
+    for entry in entries:
+        if isinstance(entry.value, Withdrawal):
+            del inputs[-1:]
+        elif entry.role == INPUT:
+            inputs.append(entry.value)  # type: ignore[arg-type]
+    return inputs
 
 
 def _subject(event: ControlEvent) -> str:
@@ -253,23 +224,55 @@ class Recovery:
         self._generation = max(folders)
         newest = folders[self._generation]
         self._segment = len(list(newest.glob("*.jsonl")))
-        entries = [e for number in range(self._segment) for e in read_journal(newest, str(number), _JOURNAL_TYPES)]
-        header = entries[0].value
-        assert isinstance(header, JournalHeader)
+        if any(is_in_use(path) for path in newest.glob(f"*.{LINES}")):
+            raise HmtSlamError(f"{folder} is in use by another node: give each system a folder recovery of its own")
+        header, entries = _read_generation(newest)
         self.stamps, self.tracking_reset = dict(header.stamps), header.tracking_reset
         for entry in entries:
             self._track(entry)
-        inputs = [e.value for e in entries if e.role == _INPUT]
+        inputs = _valid_inputs(entries)
         activation = self._control_state.get((ActivationChange, ""))
         active = activation.active if isinstance(activation, ActivationChange) else None
-        return RecoveredState(header, newest / _STATE, list(self._recent_outputs), inputs, active)  # type: ignore[arg-type]
+        return RecoveredState(header, newest / _STATE, list(self._recent_outputs), inputs, active)
+
+    def withdraw_input(self) -> RecoveredState | None:
+        """Withdraw the last input from the journal; return what the process stood on before it, None without a journal.
+
+        :raises HmtSlamError: where the journal is damaged.
+        """
+        self._append(JournalEntry(INPUT, Withdrawal()))
+        if self._journal is None or self._folder is None:
+            return None
+        newest = self._folder / str(self._generation)
+        header, entries = _read_generation(newest)
+        return RecoveredState(header, newest / _STATE, [], _valid_inputs(entries), None)
+
+    def quarantine(self, message: Message) -> str:
+        """Keep a message that its process could not handle; return where, empty where it is not kept.
+
+        Beside the folder of the journal is one that stays after the end of the node.
+        """
+        if self._folder is None:
+            return ""
+        folder = self._folder.with_name(f"{self._folder.name}{_QUARANTINE}")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            number = len(list(folder.glob(f"*.{LINES}")))
+            if number >= _MAX_QUARANTINED:
+                return ""
+            journal = Journal(folder, f"{number}-{type(message).__name__}")
+            journal.append(INPUT, message)
+            journal.close()
+        except OSError:  # a full disk, or a name that is taken
+            return ""
+        return str(folder / f"{number}-{type(message).__name__}.{LINES}")
 
     def _track(self, entry: JournalEntry) -> None:
         """Keep what the next generation starts with."""
         value = entry.value
         if isinstance(value, ControlEvent):
             self._control_state[type(value), _subject(value)] = value
-        elif entry.role == _OUTPUT:
+        elif entry.role == OUTPUT:
             self._recent_outputs.append(value)  # type: ignore[arg-type]
         elif isinstance(value, TrackingReset):
             self.tracking_reset = value
@@ -286,7 +289,7 @@ class Recovery:
 
     def record_input(self, value: Message | ControlEvent) -> None:
         """Write an input to the journal, before it is handled."""
-        entry = JournalEntry(_INPUT, value)
+        entry = JournalEntry(INPUT, value)
         self._track(entry)
         self._append(entry)
 
@@ -298,6 +301,10 @@ class Recovery:
     def add_busy_time(self, seconds: float) -> None:
         """Add to the computing time since the last checkpoint."""
         self._busy_seconds += seconds
+
+    def require_checkpoint(self) -> None:
+        """Let a checkpoint be due, so that no successor meets the inputs of the journal again."""
+        self._busy_seconds = math.inf
 
     @property
     def is_checkpoint_due(self) -> bool:
@@ -364,20 +371,36 @@ class Recovery:
         complete = self._folder / str(self._generation + 1)
         partial = complete.with_suffix(_PARTIAL)
         shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        write(partial)
-        journal = Journal(partial, "0")
-        journal.append(_HEADER, header)
-        for event in self._control_state.values():
-            journal.append(_INPUT, event)
-        for message in self._recent_outputs:
-            journal.append(_OUTPUT, message)
-        partial.rename(complete)
+        try:
+            journal = self._write_generation(partial, header, write)
+            partial.rename(complete)
+        except OSError:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
         before, self._journal = self._journal, journal
         if before is not None:
             before.close()
         shutil.rmtree(self._folder / str(self._generation), ignore_errors=True)
         self._generation, self._segment = self._generation + 1, 1
+
+    def _write_generation(self, folder: Path, header: JournalHeader, write: Callable[[Path], None]) -> Journal:
+        """Write a checkpoint and the beginning of a journal into a new folder.
+
+        :raises OSError: where that fails.
+        """
+        folder.mkdir(parents=True)
+        write(folder)
+        journal = Journal(folder, "0")
+        try:
+            journal.append(HEADER, header)
+            for event in self._control_state.values():
+                journal.append(INPUT, event)
+            for message in self._recent_outputs:
+                journal.append(OUTPUT, message)
+        except OSError:
+            journal.close()
+            raise
+        return journal
 
     def _append(self, entry: JournalEntry) -> None:
         if self._journal is None:

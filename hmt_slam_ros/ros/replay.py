@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import sys
 import tempfile
 import time
@@ -13,37 +14,40 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import Float64MultiArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.documents import ros_yaml, yaml_value
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.messages.documents import RobotStatus, decode
+from hmt_slam_ros.messages.documents import RobotStatus
 from hmt_slam_ros.messages.messages import AreaEvents, Message
 from hmt_slam_ros.messages.routing import SUBSCRIPTIONS
+from hmt_slam_ros.messages.system_name import SystemName
 from hmt_slam_ros.open_log import is_simulated, open_log
 from hmt_slam_ros.process_table import COORDINATOR, RECORDER, consumer_count, process_names, producer
 from hmt_slam_ros.results.final_map import deskewed_scans, final_map
 from hmt_slam_ros.results.output_folder import RunMetrics, atomic_output, write_output
 from hmt_slam_ros.results.recorder import Recorder, Recording
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import stamp_from_time
-from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
+from hmt_slam_ros.ros.conversions import costs_from_message, stamp_from_time
+from hmt_slam_ros.ros.diagnostics import SYSTEM, NodeDiagnostics
 from hmt_slam_ros.ros.execution import wait_until_alone
-from hmt_slam_ros.ros.message_io import Inbox
+from hmt_slam_ros.ros.guarded_node import GuardedNode
+from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
 from hmt_slam_ros.ros.node_processes import NodeProcesses, ResourceUsage, own_domain
-from hmt_slam_ros.ros.topics import COST, DIAGNOSTICS, ROBOT_STATUS, TFMessage
+from hmt_slam_ros.ros.topics import COST, DIAGNOSTICS, TFMessage
 from hmt_slam_ros.sensors import Scan
 
 STALL_TIMEOUT = 180.0
 """Time without any message after which a run is given up, s; a first run may compile kernels that long."""
+_FAULT_TIMEOUT = 5.0
+"""Time without any message after which a run with a fault is given up, s; a stranger may report faults, too."""
 _DISCOVERY_TIMEOUT = 60.0
 """Time in which the nodes must find each other, s."""
 _DIAGNOSTICS_TIMEOUT = 3.0
@@ -54,17 +58,17 @@ _SPIN = 0.05  # s
 _DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"  # environment variable
 
 
-class RecorderNode(Node):
+class RecorderNode(GuardedNode):
     """Node of the recorder, in the process that started the other nodes.
 
     :ivar recorder: the recorder.
     :ivar message_count: number of messages received, as a sign of progress.
     :ivar robot_status: the last status of the robot, None before the first.
     :ivar diagnostics_stamps: {node: stamp of its last diagnostics, ns}.
-    :ivar fault: sentence of a node about a fault that ends the run, None without.
+    :ivar fault: sentence of a node about a fault that the run does not survive, None without.
     """
 
-    def __init__(self, configuration: Configuration, context: Context) -> None:
+    def __init__(self, configuration: Configuration, context: Context, system: str) -> None:
         super().__init__(RECORDER.name, context=context)
         self.recorder = Recorder(configuration)
         self.message_count = 0
@@ -73,13 +77,13 @@ class RecorderNode(Node):
         self.fault: str | None = None
         self._costs: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
         self.area_event_count = 0
-        self._diagnostics = NodeDiagnostics(self)
+        self.diagnostics = NodeDiagnostics(self, SystemName(system))
         self._inbox = Inbox(
-            self, (*SUBSCRIPTIONS[RECORDER.name], AreaEvents), self._on_message, self._diagnostics, topics.CHAIN
+            self, (*SUBSCRIPTIONS[RECORDER.name], AreaEvents), self._on_message, self.diagnostics, topics.CHAIN
         )
-        self.create_subscription(String, ROBOT_STATUS, self._on_robot_status, topics.LATCHED)
+        subscribe_document(self, RobotStatus, self._on_robot_status, topics.LATCHED)
         self.create_subscription(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, topics.STREAM)
-        self.create_subscription(Float64MultiArray, COST, self._on_cost, topics.CHAIN)
+        self.create_subscription(Float64MultiArray, COST, self._on_cost, topics.COST_HISTORY)
 
     @property
     def is_complete(self) -> bool:
@@ -125,22 +129,24 @@ class RecorderNode(Node):
         self.area_event_count += isinstance(message, AreaEvents)
         self.recorder.handle(message)
 
-    def _on_robot_status(self, message: String) -> None:
-        status = decode(message.data, RobotStatus)
+    def _on_robot_status(self, status: RobotStatus) -> None:
         if self.robot_status is None or status.scans > self.robot_status.scans:
             self.message_count += 1
         self.robot_status = status
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        own = KeyValue(key=SYSTEM, value=self.diagnostics.system.name)
         for status in message.status:
+            if own not in status.values:
+                continue
             name = status.name.rsplit("/", 1)[-1]
             self.diagnostics_stamps[name] = stamp_from_time(message.header.stamp)
             if status.level == DiagnosticStatus.ERROR and self.fault is None:
                 self.fault = f"{name}: {status.message}"
 
     def _on_cost(self, message: Float64MultiArray) -> None:
-        rows = np.frombuffer(message.data, dtype=np.float64).reshape(-1, 3)
-        self._costs[message.layout.dim[0].label].append(rows)
+        name, rows = costs_from_message(message, self.diagnostics.system.admit)
+        self._costs[name].append(rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,6 +257,7 @@ class _ReplayRun:
     ) -> None:
         self._configuration, self._progress = configuration, progress
         self._stall_timeout, self._view_port = stall_timeout, view_port
+        self._system = f"replay-{secrets.token_hex(8)}"
 
     def run(self, log: Path, slam_settings: list[str]) -> None:
         """Start the nodes, record until the end, stop them.
@@ -278,7 +285,7 @@ class _ReplayRun:
             context = Context()
             context.init(domain_id=domain)
         try:
-            self.recorder_node = RecorderNode(self._configuration, context)
+            self.recorder_node = RecorderNode(self._configuration, context, self._system)
             executor = SingleThreadedExecutor(context=context)
             executor.add_node(self.recorder_node)
             try:
@@ -296,9 +303,10 @@ class _ReplayRun:
         parameters = scratch / "parameters.yaml"
         parameters.write_text(ros_yaml(self._configuration), encoding="utf-8")
         environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), _DISCOVERY_RANGE: "LOCALHOST"}
+        system = ["-p", f"system:={self._system}"]
         if self._view_port is not None:
-            children.start("view", ["-p", f"port:={self._view_port}"], environment)
-        shared = ["--params-file", str(parameters)]
+            children.start("view", ["-p", f"port:={self._view_port}", *system], environment)
+        shared = ["--params-file", str(parameters), *system]
         recovery = ["-p", f"recovery:={scratch / 'recovery'}"]
         for name in process_names():
             children.start(name, shared + recovery + (slam_settings if name == COORDINATOR else []), environment)
@@ -318,6 +326,7 @@ class _ReplayRun:
             now = time.monotonic()
             if self.recorder_node.message_count > count:
                 count, last = self.recorder_node.message_count, now
+                self.recorder_node.fault = None
             if now - checked > _SPIN:
                 checked = now
                 self._progress(len(self.recorder_node.recorder.estimates))
@@ -326,7 +335,7 @@ class _ReplayRun:
 
     def _check_progress(self, children: NodeProcesses, silence: float) -> None:
         children.restart_killed()
-        if self.recorder_node.fault is not None:
+        if self.recorder_node.fault is not None and silence > _FAULT_TIMEOUT:
             raise HmtSlamError(self.recorder_node.fault)
         if silence > self._stall_timeout:
             name = self.recorder_node.awaited_node()

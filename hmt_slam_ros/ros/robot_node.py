@@ -5,7 +5,6 @@ With ``robot.drive = commands`` it follows /cmd_vel, and publishes its true pose
 
 from __future__ import annotations
 
-import math
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -36,8 +35,9 @@ from hmt_slam_ros.messages.documents import RobotStatus, encode
 from hmt_slam_ros.messages.messages import LocalEstimate, Message, TrackingReset
 from hmt_slam_ros.open_log import is_simulated, open_log
 from hmt_slam_ros.ros import conversions, topics
+from hmt_slam_ros.ros.chain_writer import publish_reliably
 from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
-from hmt_slam_ros.ros.message_io import Inbox, publish_reliably
+from hmt_slam_ros.ros.message_io import Inbox
 from hmt_slam_ros.ros.parameters import ConfiguredNode, declare_frame
 from hmt_slam_ros.ros.player import Player
 from hmt_slam_ros.ros.topics import (
@@ -63,6 +63,8 @@ _BURST = 20
 """Measurements that are sent between two such checks."""
 _ACKNOWLEDGEMENT_TIMEOUT = 10.0
 """Time without an acknowledgement after which that is reported, s."""
+_MAX_VELOCITY = 100.0
+"""Magnitude of a velocity command, m/s and rad/s, beyond any robot's."""
 _REPEAT_PERIOD = 10.0
 """Time after which a warning about velocity commands is repeated, s."""
 
@@ -119,7 +121,7 @@ class DrivenRobotSource:
 
     def _on_command(self, command: Twist) -> None:
         speed, turn_rate = command.linear.x, command.angular.z
-        if not (math.isfinite(speed) and math.isfinite(turn_rate)):
+        if not (abs(speed) <= _MAX_VELOCITY and abs(turn_rate) <= _MAX_VELOCITY):  # nor for NaN
             self._node.get_logger().warning(
                 f"cmd_vel has {speed:g} m/s and {turn_rate:g} rad/s, and the robot stops: send finite velocities",
                 throttle_duration_sec=_REPEAT_PERIOD,
@@ -143,10 +145,10 @@ class RobotNode(ConfiguredNode):
         self._odom_frame = declare_frame(self, "odom", "odom")
         self._base_frame = declare_frame(self, "base", "base_link")
         self._laser_frame = declare_frame(self, "laser", "laser")
-        self.diagnostics = NodeDiagnostics(self)
+        self.diagnostics = NodeDiagnostics(self, self.system)
         self._driven_robot: DrivenRobotSource | None = None
         self._log = self._open_log()
-        self._player = Player(self._log, self._settings)
+        self._player = Player(self._log, self._settings, self.configuration.motion.patience)
         self._state: PlaybackState = "waiting"
         self._laser_frames: dict[bytes, tuple[str, NDArray[np.float64]]] = {}
         self._started_at = self._last_progress = time.monotonic()
@@ -252,11 +254,11 @@ class RobotNode(ConfiguredNode):
         self._clock_times.publish(ClockMessage(clock=conversions.time_message(measurement.stamp)))
         if isinstance(measurement, Scan):
             frame = self._announced_laser_frame(measurement)
-            publish_reliably(self._scans, conversions.scan_message(measurement, frame))
+            publish_reliably(self._scans, conversions.scan_message(measurement, frame), self.context)
         else:
             frames = self._odom_frame, self._base_frame
             self._send_transforms([conversions.transform_message(measurement.stamp, *frames, measurement.pose)])
-            publish_reliably(self._readings, conversions.odometry_message(measurement, *frames))
+            publish_reliably(self._readings, conversions.odometry_message(measurement, *frames), self.context)
         self.diagnostics.sent[type(measurement).__name__] += 1
         if self._driven_robot is not None:
             self._driven_robot.publish_ground_truth(measurement.stamp)
@@ -308,7 +310,7 @@ class RobotNode(ConfiguredNode):
             player.readings_sent,
             player.scans_acknowledged,
         )
-        self._statuses.publish(String(data=encode(status)))
+        self._statuses.publish(String(data=encode(status, system=self.system.name)))
         if (
             self._state == "playing"
             and player.is_held_up

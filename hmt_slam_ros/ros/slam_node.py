@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
-from sensor_msgs.msg import LaserScan
 from std_srvs.srv import SetBool, Trigger
 
 from hmt_slam_ros.configuration import Configuration
@@ -19,6 +18,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.documents import RobotStatus
+from hmt_slam_ros.messages.gate import check_belief
 from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
 from hmt_slam_ros.messages.messages import ClosureDecision, EndOfLog, Keyframe, LocalEstimate, Message, PoseReset
 from hmt_slam_ros.messages.replica import FIRST_AREA
@@ -30,8 +30,9 @@ from hmt_slam_ros.ros.map_services import MapLoader, MapSaver, MapServicesNode, 
 from hmt_slam_ros.ros.message_io import subscribe_document
 from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_pose
 from hmt_slam_ros.ros.recovery import CHECKPOINT, ControlEvent, FrameMounting, PauseChange
-from hmt_slam_ros.ros.sensor_input import LaserMountings, SensorMonitor, SensorSubscription
-from hmt_slam_ros.ros.topics import INITIAL_POSE, PARTICLES, SCAN
+from hmt_slam_ros.ros.scan_intake import ScanIntake
+from hmt_slam_ros.ros.sensor_input import LaserMountings
+from hmt_slam_ros.ros.topics import INITIAL_POSE, PARTICLES
 from hmt_slam_ros.saved_map.folder import VERSION, FolderReader
 from hmt_slam_ros.sensors import Odometry, Scan
 
@@ -56,8 +57,6 @@ class SlamNodeState:
     dropped_scans: int
 
 
-_LIVE_QUEUE = 200
-"""Scans in the queue of a live laser above which new ones are dropped; a replay never drops any."""
 _NODE_STATE = "node"
 _END_TIMEOUT = 5.0
 """Time without scans after which the last ones of a log are no longer awaited, s."""
@@ -108,9 +107,14 @@ class SlamNode(MapServicesNode):
         self._stale_subscribers.check_gone()
         super().configure_node()
         self._mountings = LaserMountings(
-            self, self._base_frame, self._laser_pose, self.deliver_ready_scans, self.recovery.record_input
+            self,
+            self.diagnostics,
+            self._base_frame,
+            self._laser_pose,
+            self.deliver_ready_scans,
+            self.recovery.record_input,
         )
-        self._scan_intake = ScanIntake(self, self._mountings, self.resume_stamps.get("Scan"))
+        self._scan_intake = ScanIntake(self, self._mountings, self.deliver_ready_scans, self.resume_stamps.get("Scan"))
         self._end_status: RobotStatus | None = None
         self._scans_at_end = -1
         self._area_poses: dict[int, AreaPose] = {}
@@ -121,7 +125,7 @@ class SlamNode(MapServicesNode):
         self._saver = MapSaver(self, self._deliver_held)
         self._loader = MapLoader(self, self._deliver_held)
         self._particles = self.create_publisher(PoseArray, PARTICLES, topics.STREAM)
-        subscribe_document(self, self.diagnostics, RobotStatus, self._on_robot_status, topics.LATCHED)
+        subscribe_document(self, RobotStatus, self._on_robot_status, topics.LATCHED, may_be_unnamed=True)
         self.create_service(Trigger, "~/relocalize", self._relocalize)
         self.create_service(SetBool, "~/pause", self._pause)
         self.create_timer(PERIOD, self._check_inputs, clock=self.diagnostics.steady_clock)
@@ -230,9 +234,11 @@ class SlamNode(MapServicesNode):
                     f"the pose is in the frame '{message.header.frame_id}', not in '{self.map_frame}': set the fixed "
                     "frame of RViz, or map_frame"
                 )
-            initial_pose = self._locate_in_map(conversions.gaussian_from_message(message.pose))
+            belief = conversions.gaussian_from_message(message.pose)
+            check_belief(belief, "pose")
+            initial_pose = self._locate_in_map(belief)
         except HmtSlamError as fault:
-            self.diagnostics.warn(f"{INITIAL_POSE} is left out: {fault}")
+            self.diagnostics.refuse(INITIAL_POSE, fault)
             return
         self._scan_intake.discard_waiting()
         self.deliver(PoseReset(initial_pose))
@@ -345,6 +351,7 @@ class SlamNode(MapServicesNode):
     def _check_inputs(self) -> None:
         """Report missing inputs once a second, and stop to wait for lost scans."""
         self.diagnostics.values["waiting scans"] = self.process.queued_scans + self._scan_intake.waiting_count
+        self.deliver_ready_scans()
         self._scan_intake.warn_if_waiting()
         if not self.is_active:
             return
@@ -378,115 +385,3 @@ class SlamNode(MapServicesNode):
             in_map = se2.compose(self._area_poses[area].pose.mean, poses)
             header = conversions.header_message(stamp, self.map_frame)
             self._particles.publish(PoseArray(header=header, poses=[conversions.pose_message(pose) for pose in in_map]))
-
-
-class ScanIntake:
-    """Scans on their way to metric SLAM: they wait for the laser's transform, are skipped in a pause, or dropped.
-
-    :ivar monitor: checks of stamps and rates.
-    :ivar dropped_count: number of scans that the process does not get.
-    :ivar is_paused: whether scans are skipped.
-    :ivar last_scan_at: time of the last scan by the monotonic clock, s.
-    """
-
-    def __init__(self, node: SlamNode, mountings: LaserMountings, resume_stamp: int | None) -> None:
-        """Prepare; :meth:`start` subscribes.
-
-        :param resume_stamp: stamp of the last scan before, ns, as in :class:`SensorSubscription`.
-        """
-        self._node, self._mountings = node, mountings
-        self.monitor = SensorMonitor(node.diagnostics)
-        self.dropped_count, self.is_paused = 0, False
-        self.last_scan_at = self._waiting_since = time.monotonic()
-        self._waiting: deque[LaserScan] = deque()
-        self._skipped: LaserScan | None = None
-        self._has_warned = False
-        self._subscription = SensorSubscription(node, node.diagnostics, LaserScan, SCAN, self._on_scan, resume_stamp)
-
-    @property
-    def waiting_count(self) -> int:
-        """Number of scans that wait for the laser's transform."""
-        return len(self._waiting)
-
-    def start(self) -> None:
-        """Subscribe; what was missed since :meth:`stop` comes first, where the publisher is latched."""
-        self.last_scan_at = time.monotonic()
-        self.monitor.start()
-        self._subscription.start()
-
-    def stop(self) -> None:
-        """Unsubscribe."""
-        self._subscription.stop()
-
-    def discard_waiting(self) -> None:
-        """Drop the scans that wait for the laser's transform."""
-        self._waiting.clear()
-
-    def reset_stamp_order(self) -> None:
-        """Accept any stamp of the next scan."""
-        self.monitor.reset()
-        self._subscription.reset_order()
-
-    def pause(self, *, on: bool) -> None:
-        """Skip scans from now on, or resume."""
-        self.is_paused = on
-        self._node.diagnostics.values["paused"] = "yes, scans are passed over" if on else "no"
-
-    def process_skipped(self) -> None:
-        """After a pause, process its last scan, by which the robot is found again."""
-        skipped, self._skipped = self._skipped, None
-        if skipped is not None and not self.is_paused:
-            self._enqueue(skipped)
-
-    def count_scan(self) -> None:
-        """Count a scan that has come."""
-        self.last_scan_at = time.monotonic()
-        self.monitor.note_scan()
-        self._node.diagnostics.received["Scan"] += 1
-
-    def _on_scan(self, message: LaserScan) -> None:
-        self.count_scan()
-        if self.is_paused:
-            self._count_dropped(self._skipped is not None)
-            self._skipped = message
-            return
-        self._enqueue(message)
-
-    def _enqueue(self, message: LaserScan) -> None:
-        """Process a scan as soon as its laser's transform is known."""
-        if self._subscription.is_best_effort and self._node.process.queued_scans + self.waiting_count >= _LIVE_QUEUE:
-            self._count_dropped(1)
-            self._node.diagnostics.warn(
-                "scans come faster than they can be worked off: some are dropped, lower filter.particles"
-            )
-            return
-        if not self._waiting:
-            self._waiting_since, self._has_warned = time.monotonic(), False
-        self._waiting.append(message)
-        self._node.deliver_ready_scans()
-
-    def _count_dropped(self, count: int) -> None:
-        self.dropped_count += count
-        self._node.diagnostics.values["dropped scans"] = self.dropped_count
-
-    def deliver_ready(self) -> None:
-        """Deliver the scans whose laser's transform is known."""
-        while self._waiting:
-            scan = self._mountings.convert_scan(self._waiting[0])
-            if scan is None:
-                return
-            self._waiting.popleft()
-            self._node.deliver(scan)
-
-    def warn_if_waiting(self) -> None:
-        """Report scans that wait for long: first as a warning, then as a fault.
-
-        When many nodes start, DDS may take that long to bring latched transforms.
-        """
-        now = time.monotonic()
-        if not self._waiting or now - self._waiting_since <= 2 * PERIOD:
-            return
-        report = self._node.diagnostics.fail if self._has_warned else self._node.diagnostics.warn
-        report(self._mountings.missing_transform_text(self._waiting[0], self.waiting_count))
-        self._has_warned = True
-        self._waiting_since = now + 10 * PERIOD

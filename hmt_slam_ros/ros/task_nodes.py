@@ -13,7 +13,8 @@ from hmt_slam_ros.compilation import report_compilation
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.messages.documents import ResetRequest, decode, encode
+from hmt_slam_ros.messages.documents import ResetRequest, encode
+from hmt_slam_ros.messages.gate import check_belief
 from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
 from hmt_slam_ros.messages.messages import ClosureDecision, Message, PoseReset, RealTimePose
 from hmt_slam_ros.messages.replica import FIRST_AREA, GlobalPoses, Replica
@@ -34,12 +35,11 @@ from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.execution import spin_until
 from hmt_slam_ros.ros.initial_state import InitialState, declare_start_from
 from hmt_slam_ros.ros.lifecycle import ManagedNode
-from hmt_slam_ros.ros.message_io import Inbox
+from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
 from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_pose
-from hmt_slam_ros.ros.sensor_input import LaserMountings
+from hmt_slam_ros.ros.sensor_input import LaserMountings, check_scan_message
 from hmt_slam_ros.ros.topics import (
     CMD_VEL,
-    DOCUMENTS,
     GOAL_POSE,
     HMT_POSE,
     INITIAL_POSE,
@@ -49,10 +49,13 @@ from hmt_slam_ros.ros.topics import (
     TASK_RESULTS,
 )
 from hmt_slam_ros.sensors import Odometry
+from hmt_slam_ros.untrusted_input import shorten
 
 _UNKNOWN_POSE = PoseGaussian.from_pose(np.zeros(3))
 _FIRST_AREA_POSE = AreaPose(FIRST_AREA, PoseGaussian.from_pose(np.zeros(3)))
 """Pose of the first area, whose frame is the map's; known before the first closure decision."""
+_MAX_GAP_CHECKS = 2
+"""Further checks, once a second, that find the same gap in the chain before the node ends."""
 _MISSING_TRANSFORMS = 20
 """Scans without a transform after which that is reported."""
 
@@ -102,13 +105,15 @@ class TaskNode(ManagedNode):
         :raises HmtSlamError: for a map that is damaged or does not match.
         """
         self._reset_number, self._scans_without_mounting = 0, 0
+        self._last_gap: str | None = None
+        self._gap_checks = 0
         initial_state = InitialState(self, self._start_from, lost=True)
         self._process = self.make_process(initial_state)
         report_compilation(self.get_logger().info)
         self._commands = self.create_publisher(Twist, CMD_VEL, topics.STREAM) if self.is_driver else None
         self._result_publisher = self.create_publisher(String, TASK_RESULTS[self._name], topics.LATCHED)
         self._goals = self.create_publisher(PoseStamped, GOAL_POSE, topics.STREAM)
-        self._mountings = LaserMountings(self, self._base_frame, self._laser_pose)
+        self._mountings = LaserMountings(self, self.diagnostics, self._base_frame, self._laser_pose)
         self.create_subscription(PoseWithCovarianceStamped, HMT_POSE, self._on_pose, topics.NEWEST)
         self.create_subscription(LaserScan, SCAN, self._on_scan, topics.NEWEST)
         self.create_subscription(String, TASK_GOALS[self._name], self._on_task, topics.STREAM)
@@ -120,7 +125,7 @@ class TaskNode(ManagedNode):
             first_event=initial_state.events,
             reset_number=0,
         )
-        self.create_subscription(String, DOCUMENTS[ResetRequest], self._on_reset_request, topics.CHAIN)
+        subscribe_document(self, ResetRequest, self._on_reset_request, topics.CHAIN)
         self.create_timer(PERIOD, self._check_chain, clock=self.diagnostics.steady_clock)
 
     def deactivate_node(self) -> None:
@@ -135,10 +140,18 @@ class TaskNode(ManagedNode):
     def process_message(self, message: Message) -> None:
         """Let the process handle a message, and publish its outputs."""
         outputs: list[Message] = []
-        with self.diagnostics.measure(message, outputs):
-            outputs += self._process.handle(message)
-        for output in outputs:
-            self.publish_output(output)
+        try:
+            with self.diagnostics.measure(message, outputs):
+                outputs += self._process.handle(message)
+            for output in outputs:
+                self.publish_output(output)
+        except (ArithmeticError, LookupError, TypeError, ValueError) as fault:
+            kind = type(message).__name__
+            self.diagnostics.count_refused(f"{kind}, set aside")
+            self.diagnostics.warn(
+                f"{self._name} could not handle a {kind} ({shorten(repr(fault))}) and goes on without it: report the "
+                "fault with the log"
+            )
 
     def publish_output(self, message: Message) -> None:
         """Publish an output of the process; a goal only where its area has a pose in the map."""
@@ -157,11 +170,12 @@ class TaskNode(ManagedNode):
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         try:
             area = conversions.area_from_frame(message.header.frame_id)
+            belief = conversions.gaussian_from_message(message.pose)
+            check_belief(belief, "pose")
         except HmtSlamError as fault:
-            self.diagnostics.warn(f"{HMT_POSE}: {fault}")
+            self.diagnostics.refuse(HMT_POSE, fault)
             return
         stamp = conversions.stamp_from_time(message.header.stamp)
-        belief = conversions.gaussian_from_message(message.pose)
         self.process_message(
             RealTimePose(stamp, area, _UNKNOWN_POSE, belief, _UNKNOWN_POSE, np.zeros(3), np.zeros((3, 3)))
         )
@@ -169,8 +183,12 @@ class TaskNode(ManagedNode):
     def _on_scan(self, message: LaserScan) -> None:
         if not self.is_active:
             return
+        try:
+            scan = self._mountings.convert_scan(check_scan_message(message))
+        except HmtSlamError as fault:
+            self.diagnostics.refuse(SCAN, fault)
+            return
         self.diagnostics.received["Scan"] += 1
-        scan = self._mountings.convert_scan(message)
         if scan is not None:
             self.process_message(scan)
             return
@@ -178,12 +196,8 @@ class TaskNode(ManagedNode):
         if self._scans_without_mounting == _MISSING_TRANSFORMS:
             self.diagnostics.warn(self._mountings.missing_transform_text(message, self._scans_without_mounting))
 
-    def _on_reset_request(self, message: String) -> None:
-        """Start again with the same map as the processes; a task ends with its map.
-
-        :raises HmtSlamError: where the process cannot start from that map.
-        """
-        request = decode(message.data, ResetRequest)
+    def _on_reset_request(self, request: ResetRequest) -> None:
+        """Start again with the same map as the processes; a task ends with its map."""
         if request.number <= self._reset_number:
             return
         self.process_message(Task("stop"))
@@ -192,7 +206,8 @@ class TaskNode(ManagedNode):
             initial_state = InitialState(self, request.folder, lost=True)
             self._process = self.make_process(initial_state)
         except HmtSlamError as fault:
-            raise HmtSlamError(f"the map was exchanged, and {self._name} cannot go on: {fault}") from fault
+            self.diagnostics.fail(f"the map was exchanged, and {self._name} stands still until the next reset: {fault}")
+            return
         self._reset_number = request.number
         self._inbox.reset(initial_state.events, request.number)
         self._inbox.deliver_early()
@@ -202,15 +217,18 @@ class TaskNode(ManagedNode):
 
         :raises HmtSlamError: then, since the map stays incomplete.
         """
-        if self._inbox.order.fault is not None:
+        fault = self._inbox.order.fault
+        self._gap_checks = self._gap_checks + 1 if fault is not None and fault == self._last_gap else 0
+        self._last_gap = fault
+        if fault is not None and self._gap_checks == _MAX_GAP_CHECKS:
             self.deactivate_node()
-            raise HmtSlamError(self._inbox.order.fault)
+            raise HmtSlamError(fault)
 
     def _on_task(self, message: String) -> None:
         try:
             task = parse_task(message.data, self.task_kinds)
         except HmtSlamError as fault:
-            self.diagnostics.warn(str(fault))
+            self.diagnostics.refuse(TASK_GOALS[self._name], fault)
         else:
             self.process_message(task)
 
@@ -288,7 +306,7 @@ class PilotNode(TaskNode):
         super().publish_output(message)
         if isinstance(message, PlaceEstimate):
             self._stamp = message.stamp
-            self._estimates.publish(String(data=encode(message)))
+            self._estimates.publish(String(data=encode(message, system=self.system.name)))
             self.diagnostics.values["place"] = f"{message.place or 'unknown'}, {message.probability:.3f}"
         elif isinstance(message, PoseReset) and message.initial_pose is not None:
             self._publish_initial_pose(message.initial_pose)

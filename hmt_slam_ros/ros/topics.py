@@ -33,11 +33,18 @@ LIVE_SENSOR = QoSProfile(history=_KEEP_LAST, depth=50, reliability=_BEST_EFFORT)
 Readers start with SENSOR, and change to this profile when DDS reports such a writer.
 """
 CHAIN = QoSProfile(history=_KEEP_ALL, reliability=_RELIABLE, durability=_TRANSIENT)
-"""Messages of keyframe events and all that belongs to them; late readers get those of the past."""
+"""A reader of a chain topic: messages of keyframe events, with those of the past that their writer still has."""
 VOLATILE_CHAIN = QoSProfile(history=_KEEP_ALL, reliability=_RELIABLE)
 """A reader of a chain topic that does not need the past."""
 CHAIN_HISTORY = QoSProfile(history=_KEEP_LAST, depth=1000, reliability=_RELIABLE, durability=_TRANSIENT)
-"""A reader of a chain topic that wants the past, and may lose messages."""
+"""The writer of a chain topic, and a reader that wants the past but may lose messages.
+
+The depth bounds the memory of a long run, with any middleware. A reader that joins later misses the first messages.
+"""
+ESTIMATE_HISTORY = QoSProfile(history=_KEEP_LAST, depth=5000, reliability=_RELIABLE, durability=_TRANSIENT)
+"""The writer of estimates, of which there are several for each keyframe."""
+COST_HISTORY = QoSProfile(history=_KEEP_LAST, depth=100, reliability=_RELIABLE, durability=_TRANSIENT)
+"""Computing times of a node, once a second, with a row for each message."""
 LATCHED = QoSProfile(history=_KEEP_LAST, depth=1, reliability=_RELIABLE, durability=_TRANSIENT)
 """Maps, graphs and statuses: the newest message, also for late readers."""
 TF_STATIC = QoSProfile(history=_KEEP_LAST, depth=100, reliability=_RELIABLE, durability=_TRANSIENT)

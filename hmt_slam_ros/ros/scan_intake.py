@@ -1,0 +1,173 @@
+"""Scans on their way to metric SLAM: in the order of their stamps, with the pose of their laser, or not at all."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+
+from sensor_msgs.msg import LaserScan
+
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.ros.diagnostics import PERIOD
+from hmt_slam_ros.ros.map_services import MapServicesNode
+from hmt_slam_ros.ros.sensor_input import LaserMountings, SensorMonitor, SensorSubscription, check_scan_message
+from hmt_slam_ros.ros.topics import SCAN
+from hmt_slam_ros.sensors import Scan
+
+_LIVE_QUEUE = 200
+"""Scans in the queue of a live laser above which new ones are dropped; a replay never drops any."""
+_MAX_WAITING = 10_000
+"""Scans that wait for a transform, above which new ones are dropped."""
+_TRANSFORM_TIMEOUT = 3.0
+"""Time for which the scans of an unknown frame hold up those of known ones, s."""
+_MAX_UNKNOWN_FRAMES = 4
+"""Unknown frames for whose transform scans wait."""
+
+
+class ScanIntake:
+    """Scans on their way to metric SLAM: they wait for the laser's transform, are skipped in a pause, or dropped.
+
+    :ivar monitor: checks of stamps and rates.
+    :ivar dropped_count: number of scans that the process does not get.
+    :ivar is_paused: whether scans are skipped.
+    :ivar last_scan_at: time of the last scan by the monotonic clock, s.
+    """
+
+    def __init__(
+        self,
+        node: MapServicesNode,
+        mountings: LaserMountings,
+        on_received: Callable[[], None],
+        resume_stamp: int | None,
+    ) -> None:
+        """Prepare; :meth:`start` subscribes.
+
+        :param on_received: called after each scan, to deliver what is ready.
+        :param resume_stamp: stamp of the last scan before, ns, as in :class:`SensorSubscription`.
+        """
+        self._node, self._mountings, self._on_received = node, mountings, on_received
+        self.monitor = SensorMonitor(node.diagnostics)
+        self.dropped_count, self.is_paused = 0, False
+        self.last_scan_at = self._waiting_since = time.monotonic()
+        self._waiting: deque[LaserScan] = deque()
+        self._skipped: Scan | None = None
+        self._has_warned = False
+        self._unknown_since: dict[str, float] = {}
+        self._subscription = SensorSubscription(
+            node, node.diagnostics, LaserScan, SCAN, check_scan_message, self._on_scan, resume_stamp, self._receive
+        )
+
+    @property
+    def waiting_count(self) -> int:
+        """Number of scans that wait for the laser's transform."""
+        return len(self._waiting)
+
+    def start(self) -> None:
+        """Subscribe; what was missed since :meth:`stop` comes first, where the publisher is latched."""
+        self.last_scan_at = time.monotonic()
+        self.monitor.start()
+        self._subscription.start()
+
+    def stop(self) -> None:
+        """Unsubscribe."""
+        self._subscription.stop()
+
+    def discard_waiting(self) -> None:
+        """Drop the scans that wait for the laser's transform."""
+        self._waiting.clear()
+
+    def reset_stamp_order(self) -> None:
+        """Accept any stamp of the next scan."""
+        self.monitor.reset()
+        self._subscription.reset_order()
+
+    def pause(self, *, on: bool) -> None:
+        """Skip scans from now on, or resume."""
+        self.is_paused = on
+        self._node.diagnostics.values["paused"] = "yes, scans are passed over" if on else "no"
+
+    def process_skipped(self) -> None:
+        """After a pause, process its last scan, by which the robot is found again."""
+        skipped, self._skipped = self._skipped, None
+        if skipped is not None and not self.is_paused:
+            self._node.deliver(skipped)
+
+    def count_scan(self) -> None:
+        """Count a scan that has come."""
+        self._node.diagnostics.received["Scan"] += 1
+
+    def _on_scan(self, scan: Scan) -> None:
+        """Process a scan whose stamp is in order."""
+        self.count_scan()
+        if self.is_paused:
+            self._count_dropped(self._skipped is not None)
+            self._skipped = scan
+            return
+        self._node.deliver(scan)
+
+    def _receive(self, _stamp: int, message: LaserScan) -> None:
+        """Let a scan wait until its laser's transform is known."""
+        self.last_scan_at = time.monotonic()
+        self.monitor.note_scan()
+        if self._subscription.is_best_effort and self._node.process.queued_scans + self.waiting_count >= _LIVE_QUEUE:
+            self._count_dropped(1)
+            self._node.diagnostics.warn(
+                "scans come faster than they can be worked off: some are dropped, lower filter.particles"
+            )
+            return
+        if self.waiting_count >= _MAX_WAITING:
+            self._count_dropped(1)
+            return
+        if not self._waiting:
+            self._waiting_since, self._has_warned = time.monotonic(), False
+        self._waiting.append(message)
+        self._on_received()
+
+    def _count_dropped(self, count: int) -> None:
+        self.dropped_count += count
+        self._node.diagnostics.values["dropped scans"] = self.dropped_count
+
+    def deliver_ready(self) -> None:
+        """Deliver the scans whose laser's transform is known; one that cannot be used is refused.
+
+        Only those that can be used have a say in the order of stamps.
+        """
+        while self._waiting:
+            message = self._waiting[0]
+            frame = message.header.frame_id
+            try:
+                scan = self._mountings.convert_scan(message)
+                if scan is None:
+                    if self._is_awaited(frame):
+                        return
+                    raise HmtSlamError(f"nobody knows the frame '{frame}' of a scan: publish its transform")
+            except HmtSlamError as fault:
+                self._waiting.popleft()
+                self._node.diagnostics.refuse(SCAN, fault)
+                continue
+            self._unknown_since.pop(frame, None)
+            self._waiting.popleft()
+            self._subscription.push(scan.stamp, scan)
+
+    def _is_awaited(self, frame: str) -> bool:
+        """Whether the transform of a frame is awaited: for some time, or as long as no other frame's scan waits."""
+        if frame not in self._unknown_since and len(self._unknown_since) == _MAX_UNKNOWN_FRAMES:
+            return False
+        since = self._unknown_since.setdefault(frame, time.monotonic())
+        return time.monotonic() - since < _TRANSFORM_TIMEOUT or not any(
+            self._mountings.is_known(message.header.frame_id) for message in self._waiting
+        )
+
+    def warn_if_waiting(self) -> None:
+        """Report scans that wait for long: first as a warning, then as a fault.
+
+        When many nodes start, DDS may take that long to bring latched transforms.
+        """
+        now = time.monotonic()
+        if not self._waiting or now - self._waiting_since <= 2 * PERIOD:
+            return
+        report = self._node.diagnostics.fail if self._has_warned else self._node.diagnostics.warn
+        report(self._mountings.missing_transform_text(self._waiting[0], self.waiting_count))
+        self._has_warned = True
+        self._waiting_since = now + 10 * PERIOD

@@ -1,0 +1,104 @@
+"""What the services of slam do with folders: nothing of others is replaced, and what is no map is refused at once."""
+
+import asyncio
+import json
+import os
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+from nav_msgs.srv import LoadMap
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.ros.map_services import MapLoader, check_map_is_replaceable
+from hmt_slam_ros.saved_map.folder import FORMAT, MANIFEST, VERSION, FolderWriter
+
+
+def write_map(folder, kind=FORMAT):
+    writer = FolderWriter(folder)
+    writer.write_text("configuration.yaml", "")
+    writer.finish(kind, VERSION)
+    return folder
+
+
+def test_nothing_and_a_map_can_be_replaced(tmp_path):
+    check_map_is_replaceable(tmp_path / "none")
+    check_map_is_replaceable(write_map(tmp_path / "map"))
+
+
+@pytest.mark.parametrize("name", ["notes.txt", ".git/HEAD", "scans.json.bak"])
+def test_a_map_with_a_file_of_others_is_not_replaced(tmp_path, name):
+    foreign = write_map(tmp_path / "map") / name
+    foreign.parent.mkdir(exist_ok=True)
+    foreign.write_text("precious")
+    first = tmp_path / "map" / name.split("/", maxsplit=1)[0]
+    with pytest.raises(
+        HmtSlamError, match=f"something else than a map stands there, {first} is none of its files: set"
+    ):
+        check_map_is_replaceable(tmp_path / "map")
+
+
+@pytest.mark.parametrize(
+    "content", ['{"name": "web app", "icons": []}', "[]", "", '{"format": "hmt_map"}', "[" * 10_000]
+)
+def test_a_folder_with_some_manifest_is_not_replaced(tmp_path, content):
+    (tmp_path / MANIFEST).write_text(content)
+    with pytest.raises(HmtSlamError, match=r"manifest\.json is none of its files"):
+        check_map_is_replaceable(tmp_path)
+
+
+def test_a_file_a_link_and_the_folder_of_another_format_are_not_replaced(tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to(write_map(tmp_path / "map"))
+    (tmp_path / "broken").symlink_to(tmp_path / "none")
+    write_map(tmp_path / "checkpoint", "hmt_checkpoint")
+    for name in ("file", "link", "broken", "checkpoint"):
+        with pytest.raises(HmtSlamError, match="something else than a map stands there"):
+            check_map_is_replaceable(tmp_path / name)
+
+
+def load(url):
+    """The answer of the service and what it warned of."""
+    warnings = []
+    loader = MapLoader.__new__(MapLoader)
+    loader._node = SimpleNamespace(
+        is_busy=False, configuration=Configuration(), diagnostics=SimpleNamespace(warn=warnings.append)
+    )
+    response = asyncio.run(loader._load(LoadMap.Request(map_url=url), LoadMap.Response()))
+    return response.result, warnings
+
+
+@pytest.mark.parametrize("url", ["n" * 5000, "file://" + "n/" * 3000, "a\nb", "/proc/self/mem", "/dev/zero"])
+def test_what_is_no_folder_cannot_be_loaded(url):
+    result, (warning,) = load(url)
+    assert result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+    assert warning.startswith("there is no folder ")
+    assert len(warning) < 200
+
+
+def as_pipe(path):
+    os.mkfifo(path)
+
+
+def as_endless(path):
+    path.symlink_to("/dev/zero")
+
+
+def as_deep(path):
+    path.write_text("[" * 100_000)
+
+
+def as_large_number(path):
+    path.write_text(json.dumps({"format": FORMAT, "version": 10**400}))
+
+
+@pytest.mark.parametrize("make", [as_pipe, as_endless, as_deep, as_large_number])
+def test_a_folder_whose_manifest_is_none_is_refused_at_once(tmp_path, make):
+    make(tmp_path / MANIFEST)
+    result, (warning,) = load(f"file://{tmp_path}")
+    assert result == LoadMap.Response.RESULT_INVALID_MAP_DATA
+    assert f"{tmp_path} is not loaded: " in warning
+    assert len(warning) < 500

@@ -1,0 +1,242 @@
+"""A message on which a process raises an error is set aside: the process is rebuilt, also after a kill."""
+
+import json
+import os
+import signal
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_slam_ros import process_table
+from hmt_slam_ros.process_table import ProcessRow, topic_of
+
+pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+
+NAME = "fragile"
+POISON, FATAL = 13.0, 666.0
+"""Ambiguities on which the process raises an error: always, and such that it cannot be rebuilt."""
+
+
+@dataclass(frozen=True)
+class FragileState:
+    """Number of closure decisions so far."""
+
+    decisions: int = 0
+
+
+class Fragile:
+    """A process that counts closure decisions, and changes before it fails."""
+
+    def __init__(self, _configuration, state=None):
+        if Path(os.environ["UNBUILDABLE"]).exists():
+            raise MemoryError("no room")
+        self.state = state or FragileState()
+
+    def handle(self, message):
+        from hmt_slam_ros.messages.messages import Notice  # noqa: PLC0415  when the row is in the table
+
+        self.state = FragileState(self.state.decisions + 1)
+        if message.ambiguity[0, 0] == FATAL:
+            Path(os.environ["UNBUILDABLE"]).touch()
+        if message.ambiguity[0, 0] in (POISON, FATAL):
+            raise ZeroDivisionError("a fault of the program")
+        return [Notice(NAME, f"decisions: {self.state.decisions}")]
+
+
+ROW = ProcessRow(
+    name=NAME,
+    title="counts closure decisions",
+    consumes=("ClosureDecision",),
+    factory="test_ros_quarantine:Fragile",
+    state="test_ros_quarantine:FragileState",
+)
+
+
+def add_row():
+    process_table.PROCESSES = (*process_table.PROCESSES, ROW)
+
+
+class Node:
+    """The node of the fragile process, and what it publishes."""
+
+    def __init__(self, listener, start, recovery):
+        from diagnostic_msgs.msg import DiagnosticArray  # noqa: PLC0415  only where there is ROS
+        from rcl_interfaces.msg import Log  # noqa: PLC0415
+        from std_msgs.msg import String  # noqa: PLC0415
+
+        from hmt_slam_ros.ros import topics  # noqa: PLC0415
+
+        self._listener, self._start, self._recovery = listener, start, recovery
+        self._lines = listener.subscribe(Log, "/rosout", topics.CHAIN_HISTORY)
+        self.notices = listener.subscribe(String, topic_of("Notice"), topics.CHAIN)
+        self._reports = listener.subscribe(DiagnosticArray, topics.DIAGNOSTICS, topics.STREAM)
+        self._decisions = listener.node.create_publisher(String, topic_of("ClosureDecision"), topics.CHAIN)
+        self.process = None
+
+    def start(self):
+        count = len(self._reports)
+        self.process = self._start(NAME, recovery=self._recovery)
+        self.until(lambda: len(self._reports) > count)
+
+    def kill(self):
+        self.process.send_signal(signal.SIGKILL)
+        return self.process.communicate()[1]
+
+    def send(self, sequence, ambiguity=0.0):
+        from std_msgs.msg import String  # noqa: PLC0415  only where there is ROS
+
+        from hmt_slam_ros.messages.documents import encode  # noqa: PLC0415
+        from hmt_slam_ros.messages.messages import ClosureDecision  # noqa: PLC0415
+
+        message = ClosureDecision(sequence, ambiguity=np.diag([ambiguity, 0.0, 0.0]))
+        self._decisions.publish(String(data=encode(message)))
+
+    def until(self, condition):
+        self._listener.until(condition, alive=[self.process])
+
+    def values(self):
+        """The last diagnostics."""
+        return {one.key: one.value for report in self._reports[-1:] for one in report.status[0].values}
+
+    def has_logged(self, sentence):
+        """Whether a line of the log begins so."""
+        self.until(lambda: any(line.msg.startswith(sentence) for line in self._lines))
+        return True
+
+    def last_count(self):
+        """The last sentence of the process."""
+        return json.loads(self.notices[-1].data)["text"] if self.notices else ""
+
+
+@pytest.fixture
+def node(tmp_path, monkeypatch, listener, start):
+    """The node, not started yet."""
+    site = tmp_path / "site"
+    site.mkdir()
+    (site / "sitecustomize.py").write_text("import test_ros_quarantine\ntest_ros_quarantine.add_row()\n")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), str(Path(__file__).parent), *sys.path]))
+    monkeypatch.setenv("UNBUILDABLE", str(tmp_path / "unbuildable"))
+    return Node(listener, start, tmp_path / "recovery")
+
+
+def test_a_message_that_brings_a_process_to_a_fault_is_set_aside_kept_and_named(node, tmp_path):
+    node.start()
+    node.send(0)
+    node.send(1, POISON)
+    node.send(1)
+    node.until(lambda: node.last_count() == "decisions: 2")
+    node.until(lambda: node.values().get("refused on ClosureDecision, set aside") == "1")
+    (kept,) = (tmp_path / "recovery" / f"{NAME}.quarantine").glob("*.jsonl")
+    assert json.loads(kept.read_text())["value"]["sequence"] == 1
+    assert node.has_logged(
+        f"{NAME} could not handle a ClosureDecision (ZeroDivisionError('a fault of the program')) and goes on without "
+        f"it: report the fault with {kept}"
+    )
+    # The process was rebuilt as it was before, and so it is after a kill.
+    assert "ZeroDivisionError" in node.kill()
+    node.start()
+    node.send(2)
+    node.until(lambda: node.last_count() == "decisions: 3")
+    assert len(list(kept.parent.glob("*.jsonl"))) == 1
+    node.kill()
+
+
+def test_rebuilds_are_bounded(node):
+    node.start()
+    node.send(0)
+    for _ in range(4):
+        node.send(1, POISON)
+    node.until(lambda: node.values().get("refused on ClosureDecision, set aside") == "4")
+    node.send(1)
+    # The fourth one left its trace: the process counted it.
+    node.until(lambda: node.last_count() == "decisions: 3")
+    assert "could not be rebuilt" in node.kill()
+
+
+def test_a_process_that_cannot_be_rebuilt_goes_on_as_it_is_and_asks_for_a_restart(node, tmp_path):
+    node.start()
+    node.send(0)
+    node.send(1, FATAL)
+    node.until(lambda: node.values().get("refused on ClosureDecision, set aside") == "1")
+    node.send(1)
+    node.until(lambda: node.last_count() == "decisions: 3")
+    assert node.has_logged(
+        f"{NAME} could not be rebuilt (MemoryError('no room')) and goes on as it is: restart all nodes"
+    )
+    node.kill()
+
+
+def poison(folder, change):
+    """Append an entry to the journal of a killed node: its last one, changed."""
+    (generation,) = (path for path in (folder / NAME).iterdir() if path.name.isdecimal())
+    journal = max(generation.glob("*.jsonl"), key=lambda path: int(path.stem))
+    last = json.loads(journal.read_text().splitlines()[-1])
+    with journal.open("a") as file:
+        for entry in change(last):
+            file.write(json.dumps(entry) + "\n")
+
+
+def test_a_journal_with_inputs_that_are_none_is_recovered_again_and_again(node, tmp_path):
+    node.start()
+    node.send(0)
+    node.send(1)
+    node.until(lambda: node.last_count() == "decisions: 2")
+    node.kill()
+
+    def change(last):
+        yield {**last, "value": {**last["value"], "sequence": "two"}}
+        yield {**last, "value": {"of": "an older version"}}
+        yield {**last, "kind": "Odometry", "value": {"stamp": -5, "pose": last["value"]["ambiguity"]}}
+
+    poison(tmp_path / "recovery", change)
+    for k in (2, 3):
+        node.start()
+        node.send(k)
+        node.until(lambda k=k: node.last_count() == f"decisions: {k + 1}")
+        if k == 2:
+            node.until(lambda: node.values().get("refused on the journal") == "3")
+            assert node.has_logged("the journal is left out: ")
+        node.kill()
+
+
+def test_a_journal_with_an_input_on_which_the_process_fails_is_recovered_once_and_left_behind(node, tmp_path):
+    node.start()
+    node.send(0)
+    node.send(1)
+    node.send(2, 1.0)
+    node.until(lambda: node.last_count() == "decisions: 3")
+    node.kill()
+    (generation,) = (path for path in (tmp_path / "recovery" / NAME).iterdir() if path.name.isdecimal())
+    arrays = generation / "0.bin"
+    content = arrays.read_bytes()
+    assert content.count(np.float64(1.0).tobytes()) == 1
+    # As if an older version had not failed on it.
+    arrays.write_bytes(content.replace(np.float64(1.0).tobytes(), np.float64(POISON).tobytes()))
+    node.start()
+    node.until(lambda: node.values().get("refused on ClosureDecision, set aside") == "1")
+    node.send(2)
+    node.until(lambda: node.last_count() == "decisions: 3")
+    assert "goes on without it" in node.kill()
+    node.start()
+    node.send(3)
+    node.until(lambda: node.last_count() == "decisions: 4")
+    assert "goes on without it" not in node.kill()
+
+
+def test_a_folder_that_a_running_node_uses_is_left_alone(node, start, tmp_path):
+    node.start()
+    node.send(0)
+    node.until(lambda: node.last_count() == "decisions: 1")
+    second = start(NAME, recovery=tmp_path / "recovery")
+    error = second.communicate(timeout=60)[1]
+    assert second.returncode == 2
+    assert "is in use by another node: give each system a folder recovery of its own" in error
+    node.send(1)
+    node.until(lambda: node.last_count() == "decisions: 2")
+    node.kill()
+    node.start()
+    node.send(2)
+    node.until(lambda: node.last_count() == "decisions: 3")
