@@ -20,12 +20,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.sparse.csgraph import connected_components
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Scan
 

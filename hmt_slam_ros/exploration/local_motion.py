@@ -18,10 +18,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.se2 import exp_shift
 from hmt_slam_ros.sensors import Scan
 

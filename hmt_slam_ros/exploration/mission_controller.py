@@ -29,7 +29,7 @@ from hmt_slam_ros.places.place_graph import state_of
 from hmt_slam_ros.places.policy import MetricInitialPose, metric_initial_pose, next_turn, turn_towards
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.motion_model import RelativeMotion
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
 _LOOKAHEAD = 2.0

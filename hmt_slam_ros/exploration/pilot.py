@@ -34,8 +34,8 @@ from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, state_of
 from hmt_slam_ros.places.policy import MetricInitialPose, metric_initial_pose
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief, uniform_belief
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.motion_model import NO_MOTION, RelativeMotion, increment_covariance
 from hmt_slam_ros.sensors.odometry import OdometryBuffer
+from hmt_slam_ros.sensors.relative_motion import NO_MOTION, RelativeMotion, increment_covariance
 
 _AGREEMENT_GATE = chi_square_gate(0.999)
 """Gate of the squared Mahalanobis distance between two beliefs over one pose."""

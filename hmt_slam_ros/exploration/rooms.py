@@ -26,7 +26,8 @@ from hmt_slam_ros.places.floor import SideOpening
 from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, PlaceGraph
 from hmt_slam_ros.places.policy import MetricInitialPose
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.motion_model import NO_MOTION, Prediction, RelativeMotion
+from hmt_slam_ros.sensors.motion_model import Prediction
+from hmt_slam_ros.sensors.relative_motion import NO_MOTION, RelativeMotion
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 

@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import ArrayLike
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.compilation import njit
 
 _SMALL_ANGLE = 1e-5
 """Angle below which series replace quotients by the angle, rad."""

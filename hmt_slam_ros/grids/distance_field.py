@@ -14,11 +14,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
 from hmt_slam_ros.arrays import Int32, UInt8, UInt32
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.grids.patches import FAR, MASK, PATCH, SHIFT, PatchStore, writable_patch
 
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int8, Int32, UInt8, UInt32
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.se2 import transform_point
 from hmt_slam_ros.grids import patches
 from hmt_slam_ros.grids.distance_field import (

@@ -12,9 +12,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from numba import njit
-
 from hmt_slam_ros.arrays import Int8, Int32, Int64, UInt8, UInt32
+from hmt_slam_ros.compilation import njit
 
 PATCH = 32
 """Edge of a patch, cells: ``1 << SHIFT``, with the bits ``MASK`` for the cell within the patch."""

@@ -14,7 +14,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from hmt_slam_ros.compilation import njit
 
 
 class GridWalk(NamedTuple):

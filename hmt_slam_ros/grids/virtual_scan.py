@@ -11,9 +11,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.grids.patches import FAR, PATCH, GridView, field_at_four, odds_at
 from hmt_slam_ros.sensors import Scan
 

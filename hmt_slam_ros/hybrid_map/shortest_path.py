@@ -11,9 +11,9 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, inverse_pose_covariance, propagate_covariance
 from hmt_slam_ros.hybrid_map.hybrid_map import ArcTable, HybridMap

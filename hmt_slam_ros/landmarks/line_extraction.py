@@ -16,9 +16,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.geometry.gaussian import chi_square_gate
 from hmt_slam_ros.grids.virtual_scan import VirtualScan

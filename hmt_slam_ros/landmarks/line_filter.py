@@ -16,9 +16,9 @@ from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, matrix_inverse, propagate_covariance
@@ -39,7 +39,8 @@ from hmt_slam_ros.registration.consistency import (
 )
 from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.motion_model import NO_MOTION, Prediction, RelativeMotion
+from hmt_slam_ros.sensors.motion_model import Prediction
+from hmt_slam_ros.sensors.relative_motion import NO_MOTION, RelativeMotion
 from hmt_slam_ros.submap.line_map_state import PoseClones
 from hmt_slam_ros.submap.local_filter import (
     FilterStep,

@@ -12,9 +12,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.se2 import wrap_by_turns
 
 _STEPS = 6

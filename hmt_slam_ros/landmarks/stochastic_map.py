@@ -30,7 +30,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.landmarks.data_association import Pairing, compatible_pairings
 from hmt_slam_ros.landmarks.line_extraction import Lines
 from hmt_slam_ros.landmarks.line_fit import MergeGate
-from hmt_slam_ros.sensors.motion_model import RelativeMotion
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 from hmt_slam_ros.submap.line_map_state import NO_CLONES, LineMapState, PoseClones, WallLine
 
 

@@ -26,7 +26,7 @@ from hmt_slam_ros.loop_closure.joint_refinement import (
 )
 from hmt_slam_ros.registration.scan_to_scan import ScanSurfaces, extract_surfaces
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.motion_model import path_covariance
+from hmt_slam_ros.sensors.relative_motion import path_covariance
 
 _SAME_TRAVERSAL = 3
 """Largest difference in number of successive keyframes of one traversal of an area."""

@@ -12,9 +12,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.topology import RefinementParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian

@@ -27,7 +27,7 @@ from hmt_slam_ros.landmarks.area_classes import (
 from hmt_slam_ros.landmarks.line_extraction import Lines
 from hmt_slam_ros.landmarks.rays import Rays
 from hmt_slam_ros.places.observation_graph import QUARTER_TURN
-from hmt_slam_ros.sensors.motion_model import RelativeMotion
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 
 _WALL_ANGLE_TOLERANCE = math.radians(20.0)
 """Largest angle of a wall to the hallway's axis, or to the square of it, rad."""

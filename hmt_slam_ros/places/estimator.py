@@ -46,7 +46,7 @@ from hmt_slam_ros.places.observation_graph import (
 from hmt_slam_ros.places.place_graph import PlaceGraph, heading_of, node_of
 from hmt_slam_ros.places.position_belief import PositionBelief, Travel, uniform_belief
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.motion_model import RelativeMotion
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 
 _MIN_CONFIDENCE = 0.5
 """Smallest confidence of an opening."""

@@ -33,9 +33,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.landmarks import FeatureParameters, PlaceParameters
 from hmt_slam_ros.geometry.se2 import wrap_by_modulus
 from hmt_slam_ros.places.observation_graph import (

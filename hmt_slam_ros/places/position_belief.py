@@ -20,9 +20,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.landmarks import PlaceParameters
 from hmt_slam_ros.geometry.se2 import wrap_by_modulus
 from hmt_slam_ros.places.observation import ObservationModel, log_observation_ratios, log_unknown_ground_ratio

@@ -22,7 +22,7 @@ from hmt_slam_ros.messages.map_changes import AreaPose
 from hmt_slam_ros.messages.messages import ClosureDecision, LocalEstimate, Message, Notice, RealTimePose, TrackingReset
 from hmt_slam_ros.messages.replica import FIRST_AREA, GlobalPoses
 from hmt_slam_ros.sensors import Odometry
-from hmt_slam_ros.sensors.motion_model import path_covariance
+from hmt_slam_ros.sensors.relative_motion import path_covariance
 
 _SLACK_DISTANCE, _SLACK_ANGLE = 0.5, math.radians(30.0)
 """Jump of the odometry beyond the bounds of speed that is no reset yet, m and rad."""

@@ -12,9 +12,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float32, Float64, Int32, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.se2 import rotate_back
 from hmt_slam_ros.registration.search_bounds import (
     BLOCK,

@@ -22,9 +22,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.se2 import transform_point
 from hmt_slam_ros.grids.patches import FAR, PATCH, GridView, field_at
 from hmt_slam_ros.registration.scan_to_map import count_agreement

@@ -8,9 +8,9 @@ together with all other segments: several walls outweigh odometry, but a single 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.gaussian import (
     Symmetric,
     Vector,

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float32, Float64, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.registration.consistency import Agreement

@@ -19,9 +19,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.gaussian import matrix_inverse, rotate_covariance
 from hmt_slam_ros.grids.patches import GridView
 from hmt_slam_ros.registration.scan_to_map import AlignmentSettings, linearize

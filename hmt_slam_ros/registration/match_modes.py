@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.se2 import rotate_back, transform_point
 from hmt_slam_ros.registration.branch_and_bound import SearchCells
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid, SearchWindow

@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.gaussian import (
     Symmetric,
     Vector,

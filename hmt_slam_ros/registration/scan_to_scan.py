@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.topology import RefinementParameters
 from hmt_slam_ros.geometry.gaussian import Symmetric, write_to_array
 from hmt_slam_ros.geometry.se2 import rotate_back, transform_point

@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Float32, Float64, Int8, Int32, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.se2 import rotate
 
 

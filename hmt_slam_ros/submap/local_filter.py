@@ -11,7 +11,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.registration.consistency import ClutterEstimate, MapAgreement
 from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
+from hmt_slam_ros.sensors.motion_model import Prediction
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 from hmt_slam_ros.submap.line_map_state import LineMapState
 from hmt_slam_ros.submap.local_mapping import PreparedScan
 

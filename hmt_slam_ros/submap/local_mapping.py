@@ -18,9 +18,9 @@ from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from numba import njit
 
 from hmt_slam_ros.arrays import Float64, Int32
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import (
@@ -36,7 +36,8 @@ from hmt_slam_ros.registration import scan_to_map
 from hmt_slam_ros.registration.dynamic_rejection import reject_dynamic
 from hmt_slam_ros.registration.match_covariance import MatchNoise
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
+from hmt_slam_ros.sensors.motion_model import Prediction
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 from hmt_slam_ros.sensors.scan import extract_surfels
 
 _ODDS_PER_NAT = 20.0

@@ -22,7 +22,8 @@ from hmt_slam_ros.registration.consistency import ClutterEstimate, MapAgreement,
 from hmt_slam_ros.registration.match_covariance import estimate_match_error
 from hmt_slam_ros.registration.scan_to_map import Prior
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.motion_model import NO_MOTION, Prediction
+from hmt_slam_ros.sensors.motion_model import Prediction
+from hmt_slam_ros.sensors.relative_motion import NO_MOTION
 from hmt_slam_ros.submap.local_filter import (
     FilterStep,
     LineFilterState,

@@ -14,10 +14,10 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.special import ndtri
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.topology import InferenceParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, inverse_pose_covariance, propagate_covariance

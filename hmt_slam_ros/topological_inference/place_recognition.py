@@ -19,10 +19,10 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.special import softmax
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.registration.area_to_area import MatchSettings, best_pose
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
