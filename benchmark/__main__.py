@@ -31,7 +31,7 @@ from hmt_slam_ros.cli.arguments import OneSentenceParser
 from hmt_slam_ros.errors import HmtSlamError
 
 UNMET, FAULT = 1, 2
-_LEAST_MINUTES = 2.0
+_LEAST_MINUTES = 12.0
 
 MEASUREMENTS = {
     "accuracy": "trajectory errors at true relations; torn walls where there is no truth",
@@ -59,10 +59,20 @@ MEASUREMENTS = {
     "kernels": "CPU time and memory allocations of the inner loops",
     "soak": "memory of nodes that run for an hour, and what they leave behind",
     "structure": "how large the package is, and how many files one scan, one keyframe and one closure pass",
+    "mutants": "small faults of the numerical core that the unit tests notice",
+    "fuzz": "mutated and hostile logs, results, settings and maps against every command that reads them",
+    "faults": "a fault at every call that writes a map, a bag, a journal or results",
     "identity": "byte-for-byte identity of results with those on record",
     "short": "accuracy against benchmark/expected.toml, for CI",
 }
-_MODULES = {"consistency": "calibration", "topology": "loops", "sessions": "accuracy"}
+_MODULES = {
+    "consistency": "calibration",
+    "topology": "loops",
+    "sessions": "accuracy",
+    "fuzz": "fuzz.measurement",
+    "mutants": "mutants.measurement",
+    "faults": "write_faults.measurement",
+}
 _GROUPS = {
     "all": ("accuracy", "robustness", "sessions", "speed", "live"),
     "validation": (
@@ -158,7 +168,9 @@ def _make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--jobs", type=_parse_count, default=2, metavar="N", help="runs at the same time; 1 for speed")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report")
     parser.add_argument("--runs", type=Path, metavar="DIR", help="keeps simulated runs and starts, for later calls")
-    parser.add_argument("--minutes", type=_parse_minutes, default=60.0, metavar="M", help="how long soak runs")
+    parser.add_argument(
+        "--minutes", type=_parse_minutes, default=60.0, metavar="M", help="of soak and fuzz --logs guided"
+    )
     parser.add_argument("--training", action="store_true", help="simulated worlds of seeds 0 to N-1")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="set one parameter")
     parser.add_argument("--write-expected", action="store_true", help="record the figures of short or identity")
@@ -181,7 +193,7 @@ def _parse_minutes(text: str) -> float:
     minutes = float(text)
     if not minutes >= _LEAST_MINUTES:
         raise argparse.ArgumentTypeError(
-            f"{text} minutes are too few for the growth of memory: give {_LEAST_MINUTES:g} or more"
+            f"{text} minutes are too few for two hours of the log: give {_LEAST_MINUTES:g} or more"
         )
     return minutes
 

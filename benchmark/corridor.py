@@ -19,7 +19,8 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.motion_model import MotionModel, increment_covariance
+from hmt_slam_ros.sensors.motion_model import MotionModel
+from hmt_slam_ros.sensors.relative_motion import increment_covariance
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.particle_filter import ParticleFilter
 

@@ -15,7 +15,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
 from hmt_slam_ros.places.corridor_frame import BuildingHeading
 from hmt_slam_ros.places.observation_graph import QUARTER_TURN
-from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covariance
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion, increment_covariance
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.scenario import Scenario
 

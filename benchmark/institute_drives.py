@@ -23,7 +23,7 @@ from hmt_slam_ros.places.place_graph import heading_of, node_of, state_of
 from hmt_slam_ros.places.policy import MetricInitialPose
 from hmt_slam_ros.places.position_belief import certain_belief
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covariance
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion, increment_covariance
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
 from hmt_slam_ros.simulation.scenario import Scenario
 

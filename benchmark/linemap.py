@@ -15,7 +15,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.landmarks.line_extraction import extract_for_map
 from hmt_slam_ros.landmarks.stochastic_map import LineMap
 from hmt_slam_ros.random_streams import Purpose, random_stream
-from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covariance
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion, increment_covariance
 from hmt_slam_ros.simulation.building import Building, FloorPlan, Point
 from hmt_slam_ros.simulation.furniture import Rectangle, furnish
 from hmt_slam_ros.simulation.scenario import Scenario

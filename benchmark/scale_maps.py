@@ -23,11 +23,12 @@ from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.metric_slam.live_hypothesis import KeyframeCovariances
 from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.own_files import replace_folder
 from hmt_slam_ros.results.hmt_map import MapWriter, RunState, read_run_state, read_saved_map
 from hmt_slam_ros.results.log_reading import LogProgress
 from hmt_slam_ros.results.record import EstimateTable, ProbabilityTable, ScanPoseTable, TopologyProbability
-from hmt_slam_ros.saved_map.folder import replace_folder
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.submap.local_filter import ParticleFilterState
 
 BEAMS = 181
 """Beams of the scans that are saved or measured."""
@@ -107,7 +108,9 @@ def state_of(lattice: Lattice, configuration: Configuration) -> RunState:
     replica = Replica(scans, maps, probabilities, {FIRST_HYPOTHESIS: 0}).state
     covariances = KeyframeCovariances.from_dict(dict.fromkeys(keyframes, ARC))
     live = {
-        hypothesis: replace(own, keyframe_covariances=covariances)
+        hypothesis: replace(
+            own, keyframe_covariances=covariances, particle_filter=_at_first_keyframes(own.particle_filter, keyframes)
+        )
         for hypothesis, own in drive_state.processes["slam"].live_hypotheses.items()
     }
     graph = OverlapGraph(tuple(range(PER_AREA)), np.full((PER_AREA, PER_AREA), 0.5))
@@ -121,7 +124,7 @@ def state_of(lattice: Lattice, configuration: Configuration) -> RunState:
         _log_state(keyframes),
         {
             "slam": replace(
-                drive_state.processes["slam"], replica=replica, live_hypotheses=live, keyframe_events=len(keyframes)
+                drive_state.processes["slam"], replica=replica, live_hypotheses=live, keyframe_events=max(keyframes) + 1
             ),
             "aam": replace(
                 drive_state.processes["aam"], replica=replica, graphs=graphs, partitions={FIRST_HYPOTHESIS: partition}
@@ -132,6 +135,12 @@ def state_of(lattice: Lattice, configuration: Configuration) -> RunState:
         },
         replace(drive_state.recorder, replica=replica, **_recorder_fields(keyframes)),
     )
+
+
+def _at_first_keyframes(own: ParticleFilterState | None, keyframes: Sequence[int]) -> ParticleFilterState:
+    """The filter of the drive, whose keyframes are now the first of the map."""
+    assert own is not None
+    return replace(own, keyframes=tuple(keyframes[: len(own.keyframes)]))
 
 
 def _drive_state(configuration: Configuration) -> RunState:
@@ -168,7 +177,7 @@ def _recorder_fields(keyframes: Sequence[int]) -> dict[str, Any]:
         for event in range(len(keyframes))
     ]
     return {
-        "events": len(keyframes),
+        "events": max(keyframes) + 1,
         "probabilities": ProbabilityTable.from_rows(rows),
         "scan_poses": ScanPoseTable.from_messages(
             ScanPoses(FIRST_HYPOTHESIS, int(own[0]), moments, np.full(own.size, keyframe), np.zeros((own.size, 3)))

@@ -1,4 +1,4 @@
-"""Memory of nodes over a long drive at ten times real time, and resources that they do not release."""
+"""Memory of nodes over hours of driving in known rooms, at ten times real time, and resources that they keep."""
 
 from __future__ import annotations
 
@@ -36,10 +36,12 @@ WORLD = "office"
 RATE = 10.0
 """Speed of the replay relative to real time."""
 
-GROWTH = 0.05
-"""Largest growth of a node's memory from the middle to the end."""
+CHANGE = 0.02
+"""Largest change of a node's memory after the first hour of the log."""
 
 _SHORTFALL = 0.95
+_FIRST, _BASE = 1.0, 1.25
+"""End of the first hour, and of the quarter of an hour whose mean later memory is compared with, h of the log."""
 _PERIOD = 5.0  # s between two samples of memory
 _SPIN = 0.1  # s
 _DEPARTURES = 3.0  # s
@@ -48,12 +50,15 @@ _SHARED_MEMORY = "/dev/shm/"
 _PORT = "fastrtps_port"
 
 POLICY = (
-    f"The nodes, each an OS process, map laps of `sim:{WORLD}` (seed 0), which the robot node plays at "
-    f"{RATE:g} times real time, or slower if slam is behind. Resident memory is read every {_PERIOD:g} s. In the first "
-    "half the histories of DDS fill up, with 5000 messages each; the growth is that of the mean of the last tenth over "
-    "the mean of the tenth after the middle. Segments of shared memory are those that a node had mapped and that still "
-    "existed when all had ended. Segments of ports are excluded, because the next nodes reuse them. Zombies are ended "
-    "child processes of a node, or ended nodes, without a parent that read their status."
+    f"The nodes, each an OS process, map laps of `sim:{WORLD}` (seed 0), which the robot node plays at {RATE:g} "
+    f"times real time, or slower if slam is behind. Memory is read every {_PERIOD:g} s: RSS, which counts shared "
+    "pages whole, and PSS, which divides them among the processes. In the first hour of the log the map becomes "
+    "complete and the histories of DDS fill up. The change is the largest difference of the RSS after that from "
+    "its mean over the next quarter of an hour, as a share. Slopes are least squares after the first hour with "
+    "their standard errors, which assume independent samples. Segments of shared memory are those that a node had"
+    " mapped and that still existed when all had ended. Segments of ports are excluded, because the next nodes "
+    "reuse them. Zombies are ended child processes of a node, or ended nodes, without a parent that read their "
+    "status."
 )
 
 
@@ -64,7 +69,9 @@ class Soak:
     :ivar seconds: wall time, s.
     :ivar log_seconds: played time of the log, s.
     :ivar scans: acknowledged by slam.
-    :ivar resident: {node: memory at every sample, bytes}.
+    :ivar hours: played time of the log at every sample, h.
+    :ivar resident: {node: RSS at every sample, bytes}.
+    :ivar proportional: {node: PSS at every sample, bytes}.
     :ivar segments: files of shared memory of the nodes.
     :ivar leaked: those that still existed when all nodes had ended.
     :ivar zombies: largest number at a sample.
@@ -76,7 +83,9 @@ class Soak:
     seconds: float = 0.0
     log_seconds: float = 0.0
     scans: int = 0
+    hours: list[float] = field(default_factory=list)
     resident: dict[str, list[int]] = field(default_factory=dict)
+    proportional: dict[str, list[int]] = field(default_factory=dict)
     segments: set[str] = field(default_factory=set)
     leaked: set[str] = field(default_factory=set)
     zombies: int = 0
@@ -91,11 +100,15 @@ def measure_soak(settings: Settings) -> Report:
     found = run_nodes(settings.minutes)
     report.requirements += requirements(found)
     report.data["soak"] = asdict(found) | {name: sorted(getattr(found, name)) for name in ("segments", "leaked")}
-    rows = [[name, *(f"{1e-6 * value:.0f}" for value in _memory_samples(own))] for name, own in found.resident.items()]
+    rows = [
+        [name, *_summarize(found.hours, own), *_summarize(found.hours, found.proportional[name])]
+        for name, own in found.resident.items()
+    ]
+    columns = [f"{kind} {what}" for kind in ("RSS", "PSS") for what in ("at 1 h [MB]", "at the end [MB]", "[MB/h]")]
     summary = f"{found.seconds / 60:.0f} minutes, {found.log_seconds / 3600:.1f} h of driving, {found.scans} scans"
     report.body += [
         summary,
-        table(["node", "at 10 % [MB]", "at 50 %", "at 75 %", "at the end", "largest"], rows),
+        table(["node", *columns], rows),
         POLICY,
     ]
     return report
@@ -103,10 +116,13 @@ def measure_soak(settings: Settings) -> Report:
 
 def requirements(found: Soak) -> list[Requirement]:
     """Requirements on a run."""
-    growths = [Requirement(f"{name}: growth of memory", growth(own), GROWTH) for name, own in found.resident.items()]
+    changes = [
+        Requirement(f"{name}: change of memory after an hour", largest_change(found.hours, own), CHANGE)
+        for name, own in found.resident.items()
+    ]
     speed = found.log_seconds / found.seconds
     return [
-        *growths,
+        *changes,
         Requirement("speed, times real time", speed, math.inf, least=_SHORTFALL * RATE),
         Requirement("scans dropped", found.dropped, 0),
         Requirement("errors in /diagnostics", len(found.errors), 0),
@@ -118,16 +134,43 @@ def requirements(found: Soak) -> list[Requirement]:
     ]
 
 
-def growth(resident: Sequence[int]) -> float:
-    """Growth of the mean from the tenth after the middle to the last one, as a share; NaN for too few samples."""
-    tenth, middle = len(resident) // 10, len(resident) // 2
-    if not tenth:
+def largest_change(hours: Sequence[float], memory: Sequence[int]) -> float:
+    """Largest difference after the first hour from the mean of the next quarter, as a share; NaN for shorter runs.
+
+    :param hours: played time of the log at every sample, h.
+    :param memory: of a node at every sample, bytes.
+    """
+    times, values = np.array(hours), np.array(memory, dtype=np.float64)
+    is_base, is_later = (times >= _FIRST) & (times < _BASE), times >= _BASE
+    if not (is_base.any() and is_later.any()):
         return math.nan
-    return float(np.mean(resident[-tenth:]) / np.mean(resident[middle : middle + tenth])) - 1.0
+    return float(np.max(np.abs(values[is_later] / np.mean(values[is_base]) - 1.0)))
 
 
-def _memory_samples(resident: Sequence[int]) -> list[int]:
-    return [*(resident[round(share * (len(resident) - 1))] for share in (0.1, 0.5, 0.75, 1.0)), max(resident)]
+def slope(hours: Sequence[float], memory: Sequence[int]) -> tuple[float, float]:
+    """Growth after the first hour by least squares, and its standard error, bytes/h; NaN for fewer than 3 samples.
+
+    :param hours: played time of the log at every sample, h.
+    :param memory: of a node at every sample, bytes.
+    """
+    times, values = np.array(hours), np.array(memory, dtype=np.float64)
+    later = times >= _FIRST
+    count = np.count_nonzero(later)
+    if count < 3:
+        return math.nan, math.nan
+    centered = times[later] - np.mean(times[later])
+    spread = float(centered @ centered)
+    growth = float(centered @ values[later]) / spread
+    residuals = values[later] - np.mean(values[later]) - growth * centered
+    return growth, math.sqrt(float(residuals @ residuals) / (count - 2) / spread)
+
+
+def _summarize(hours: Sequence[float], memory: Sequence[int]) -> list[str]:
+    """Memory at the first hour and at the end, MB, and the slope with its error, MB/h."""
+    first = next((value for hour, value in zip(hours, memory, strict=True) if hour >= _FIRST), math.nan)
+    growth, error = slope(hours, memory)
+    last = memory[-1] if memory else math.nan
+    return [f"{1e-6 * first:.1f}", f"{1e-6 * last:.1f}", f"{1e-6 * growth:.2f} ± {1e-6 * error:.2f}"]
 
 
 def run_nodes(minutes: float) -> Soak:
@@ -138,7 +181,8 @@ def run_nodes(minutes: float) -> Soak:
     lap = open_log(f"{SIMULATION_PREFIX}{WORLD},laps=1")
     name = f"{SIMULATION_PREFIX}{WORLD},laps={math.ceil(60.0 * minutes * RATE / lap.duration) + 1}"
     laser = next(r.measurement.laser_pose for r in lap.records() if isinstance(r.measurement, Scan)).tolist()
-    found = Soak(resident={node: [] for node in (*process_names(), "robot")})
+    nodes = (*process_names(), "robot")
+    found = Soak(resident={node: [] for node in nodes}, proportional={node: [] for node in nodes})
     with (
         tempfile.TemporaryDirectory(prefix="hmt_slam_soak_") as scratch,
         own_domain() as domain,
@@ -174,11 +218,19 @@ def _observe(executor: SingleThreadedExecutor, children: NodeProcesses, found: S
 
 
 def _sample_processes(processes: Mapping[str, int], found: Soak) -> None:
+    found.hours.append(found.log_seconds / 3600.0)
     for name, pid in processes.items():
         found.resident[name].append(resident_bytes(pid))
+        found.proportional[name].append(_proportional_bytes(pid))
         found.segments |= _mapped_segments(pid)
     states = Counter(state for state, parent in _process_states() if parent in (*processes.values(), os.getpid()))
     found.zombies = max(found.zombies, states["Z"])
+
+
+def _proportional_bytes(pid: int) -> int:
+    """PSS of an OS process, bytes."""
+    rollup = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()
+    return next(1024 * int(line.split()[1]) for line in rollup if line.startswith("Pss:"))
 
 
 def _mapped_segments(pid: int) -> set[str]:

@@ -68,6 +68,7 @@ class Run:
         self.answers, self.notices = [], []
         self.evidence = {}
         self.stored = True
+        self.stale_beams = ()
 
     def keyframe(self, true_pose, cut=0, moved=None, merged=None, mapping=True):
         """One keyframe event; ``cut`` is how many of the newest keyframes leave the area, in every hypothesis.
@@ -96,7 +97,7 @@ class Run:
             )
             for h in sorted(self.poses)
         )
-        message = Keyframe(sequence, scan, 0.5 * sequence, hypotheses, mapping=mapping)
+        message = Keyframe(sequence, scan, 0.5 * sequence, hypotheses, mapping=mapping, stale_beams=self.stale_beams)
         assert self.tsbi.handle(message) == []
         self.replica.add_keyframe(message)
         return self._answer(sequence, self._events(sequence, cut, moved, merged))

@@ -16,7 +16,7 @@ from hmt_slam_ros.exploration.rooms import Destination, KnownBuilding, destinati
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.places.place_graph import opposite_direction, state_of
 from hmt_slam_ros.places.position_belief import certain_belief
-from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covariance
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion, increment_covariance
 
 LIMITS = MotionLimits(0.6, math.radians(45.0), 0.5, math.radians(90.0), 0.25)
 STEPS = 900

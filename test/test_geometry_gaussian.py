@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.stats import chi2
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, fuse
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, fuse, match_moments
 
 SAMPLES = 200_000
 
@@ -213,3 +213,27 @@ def test_the_ellipse_holds_95_percent_of_the_positions_in_the_outer_axes():
     sin, cos = math.sin(ellipse.angle), math.cos(ellipse.angle)
     along, across = away @ [cos, sin] / ellipse.semi_major, away @ [-sin, cos] / ellipse.semi_minor
     assert (along**2 + across**2 < 1.0).mean() == pytest.approx(0.95, abs=0.003)
+
+
+def test_the_moments_of_a_mixture_are_those_of_its_samples():
+    a, _, rng = two_beliefs(23)
+    others = [
+        PoseGaussian(se2.compose(a.mean, shift), covariance(rng)) for shift in ([0.3, -0.1, 0.04], [-0.2, 0.4, 0])
+    ]
+    # Weights 1, 2 and 3 of 6; the scale of the weights does not matter.
+    weighted = [(belief, math.log(7.0 * weight)) for belief, weight in zip([*others, a], (1, 2, 3), strict=True)]
+    mixed = match_moments(weighted)
+    np.testing.assert_array_equal(mixed.mean, a.mean)
+    samples = np.concatenate(
+        [draw(belief, rng, weight * 60_000) for belief, weight in zip([*others, a], (1, 2, 3), strict=True)]
+    )
+    xi = se2.log(se2.between(a.mean, samples))
+    sigma = np.sqrt(np.diag(mixed.covariance))
+    # To first order: headings differ by up to 0.04 rad.
+    np.testing.assert_allclose((xi.T @ xi / len(xi) - mixed.covariance) / np.outer(sigma, sigma), 0.0, atol=0.04)
+
+
+def test_the_moments_of_two_points_are_their_squared_distance_by_the_weight_of_the_lighter():
+    first, second = (PoseGaussian.from_pose(np.array([x, 1.0, 0.0])) for x in (2.0, 5.0))
+    mixed = match_moments([(first, math.log(0.8)), (second, math.log(0.2))])
+    np.testing.assert_allclose(mixed.covariance, np.diag([0.2 * 9.0, 0.0, 0.0]), atol=1e-12)

@@ -8,6 +8,7 @@ from hmt_slam_ros.geometry.gaussian import (
     add_scaled,
     determinant,
     dot,
+    inverse_pose_covariance,
     matrix_inverse,
     multiply,
     propagate_covariance,
@@ -46,6 +47,12 @@ def test_a_covariance_at_the_end_of_a_motion(random):
     matrix, motion = covariance(random), random.uniform(-3.0, 3.0, 3)
     ad = se2.adjoint(se2.inverse(motion))
     np.testing.assert_allclose(propagate_covariance(matrix, motion), ad @ matrix @ ad.T, atol=1e-12)
+
+
+def test_the_covariance_of_an_inverse_pose(random):
+    matrix, pose = covariance(random), random.uniform(-3.0, 3.0, 3)
+    ad = se2.adjoint(pose)
+    np.testing.assert_allclose(inverse_pose_covariance(matrix, pose), ad @ matrix @ ad.T, atol=1e-12)
 
 
 def definite(random, rank=3):

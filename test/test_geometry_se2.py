@@ -58,6 +58,8 @@ def test_the_doubles_next_to_half_a_turn_wrap_inside_the_interval():
 @given(angles)
 def test_an_angle_inside_the_interval_keeps_its_bits(angle):
     assert float(se2.wrap(angle)) == angle
+    # Also beside one that does not.
+    assert se2.wrap(np.array([angle, 7.0])).tolist() == [angle, float(se2.wrap(7.0))]
 
 
 def test_a_motion_is_done_in_the_frame_that_the_first_one_leads_to():

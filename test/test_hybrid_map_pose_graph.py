@@ -7,7 +7,14 @@ from scipy.stats import chi2
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.pose_graph import Edges, consistent_map, optimize, relative_covariances, shortest_path_map
+from hmt_slam_ros.hybrid_map.pose_graph import (
+    Edges,
+    consistent_map,
+    optimize,
+    relative_covariances,
+    shortest_path_map,
+    sparsity_pattern,
+)
 
 SPREAD = np.diag([0.05**2, 0.03**2, 0.01**2])
 
@@ -267,3 +274,19 @@ def test_covariances_of_nodes_relative_to_each_other_are_those_of_the_whole_syst
     np.testing.assert_allclose(found[3], 0.0, atol=1e-12)
     seen_back = PoseGaussian(se2.between(poses[2], poses[7]), found[0]).inverse().covariance
     np.testing.assert_allclose(found[1], seen_back, rtol=1e-9)
+
+
+def test_the_pattern_has_the_blocks_of_all_edges_and_nothing_else():
+    random = np.random.default_rng(8)
+    sources, targets = random.integers(-1, 6, (2, 12))
+    rows = np.stack((sources, sources, targets, targets), axis=1)
+    columns = np.stack((sources, targets, sources, targets), axis=1)
+    pattern = sparsity_pattern(rows, columns, 6)
+    dense = np.zeros((18, 18), bool)
+    for row, column in zip(rows.ravel(), columns.ravel(), strict=True):
+        if min(row, column) >= 0:
+            dense[3 * row : 3 * row + 3, 3 * column : 3 * column + 3] = True
+    assert len(pattern.indices) == pattern.starts[-1] == dense.sum()
+    for column in range(18):
+        found = pattern.indices[pattern.starts[column] : pattern.starts[column + 1]]
+        assert found.tolist() == np.flatnonzero(dense[:, column]).tolist()

@@ -42,6 +42,9 @@ def test_areas_within_reach_whose_position_is_certain_are_around():
 
 def test_an_area_with_a_loose_arc_is_not_around():
     assert list(areas_around(chain(0.5), 0, NEAR)) == [0]
+    # The deviation of the position has a part along each axis.
+    assert list(areas_around(chain(0.25), 0, NEAR)) == [0]
+    assert list(areas_around(chain(0.2), 0, NEAR)) == [0, 1]
 
 
 def test_an_area_beyond_reach_does_not_hide_one_behind_it():

@@ -13,7 +13,7 @@ from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
 from hmt_slam_ros.places.corridor_frame import BuildingHeading
 from hmt_slam_ros.places.observation_graph import QUARTER_TURN
-from hmt_slam_ros.sensors.motion_model import RelativeMotion
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 
 FEATURES = FeatureParameters(range_deviation=0.01)
 ROOM = box(-3.0, -2.0, 5.0, 4.0)

@@ -9,7 +9,8 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.landmarks.line_filter import FilterSelector
 from hmt_slam_ros.registration.consistency import WALLS_OF_SUBMAP
-from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
+from hmt_slam_ros.sensors.motion_model import Prediction
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 

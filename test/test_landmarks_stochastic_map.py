@@ -10,7 +10,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.landmarks.line_extraction import Lines
 from hmt_slam_ros.landmarks.stochastic_map import LineMap
-from hmt_slam_ros.sensors.motion_model import RelativeMotion
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 
 FEATURES = FeatureParameters()
 SIGMAS = np.array([0.004, 0.01])  # rad, m

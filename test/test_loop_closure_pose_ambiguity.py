@@ -13,13 +13,13 @@ THERE = np.array([4.0, 1.0, 0.5])
 ELSEWHERE = np.array([4.5, 4.0, 0.7])
 
 
-def verdict_of(probability):
+def verdict_of(probability, there=THERE, elsewhere=ELSEWHERE):
     """The robot is in area 2, at the end of one of two arcs."""
     play = Play()
     play.start()
     hypotheses = [
         Hypothesis(h, 0, p, 2, belief(se2.inverse(THERE)), (), (Arc(0, 2, belief(arc)),))
-        for h, p, arc in ((1, probability, THERE), (2, 1.0 - probability, ELSEWHERE))
+        for h, p, arc in ((1, probability, there), (2, 1.0 - probability, elsewhere))
     ]
     return play.step(*hypotheses)
 
@@ -34,6 +34,15 @@ def test_one_hypothesis_is_not_ambiguous():
 def test_it_is_the_squared_distance_of_the_others_by_their_probability(probability):
     away = se2.compose(ELSEWHERE, se2.inverse(THERE))
     np.testing.assert_allclose(verdict_of(probability).ambiguity, (1.0 - probability) * np.outer(away, away))
+
+
+@pytest.mark.parametrize(("heading", "turn"), [(0.0, 3.0), (2.5, 2.0), (-2.5, -2.0), (3.1, 0.1)])
+def test_headings_are_apart_by_half_a_turn_at_most(heading, turn):
+    """At the origin under both hypotheses, but turned by ``turn`` under the second."""
+    there, elsewhere = (se2.compose(np.array([0.0, 0.0, angle]), THERE) for angle in (heading, heading + turn))
+    for probability in (0.6, 0.9):
+        expected = (1.0 - probability) * np.diag([0.0, 0.0, turn**2])
+        np.testing.assert_allclose(verdict_of(probability, there, elsewhere).ambiguity, expected, atol=1e-9)
 
 
 def test_the_pose_in_the_map_is_as_uncertain_as_the_hypotheses_are_apart_whatever_the_heading():

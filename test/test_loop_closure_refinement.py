@@ -8,7 +8,10 @@ from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.pose_graph import Edges
 from hmt_slam_ros.loop_closure.closure_refinement import ClosureRefinement
+from hmt_slam_ros.loop_closure.joint_refinement import ScanPairs, relative_beliefs
+from hmt_slam_ros.registration.scan_to_scan import extract_surfaces
 
 ROOMS = worlds.two_rooms()
 # The first room twice, and between the visits the second one, which lies beside the closure.
@@ -71,6 +74,23 @@ def test_an_area_beside_the_closure_moves_as_a_whole_if_at_all():
     assert np.hypot(*moved[:2]) < 0.03
 
 
+def test_an_area_beside_the_closure_turns_as_its_only_keyframe_that_sees_walls_does():
+    hybrid_map, nothing = HybridMap(), np.array([[500.0, 0.0, 500.0, 1.0]])
+    home, k, scans = VISITS[0][-1], 0, {}
+    visits = {0: VISITS[0], 1: [home, se2.compose(home, [0.0, 0.0, 0.5])], 2: VISITS[2]}
+    for area, poses in visits.items():
+        for pose in poses:
+            hybrid_map.set_keyframe(k, area, se2.between(poses[0], pose))
+            scans[k] = worlds.scan_in(nothing if pose is home and area == 1 else ROOMS, pose, noise=0.01, seed=k)
+            k += 1
+    beside, joined = (se2.between(visits[0][0], visits[area][0]) for area in (1, 2))
+    hybrid_map.set_arc(0, 1, PoseGaussian(se2.compose(beside, [0.1, -0.05, 0.08]), CLOSURE), closure=False)
+    hybrid_map.set_arc(0, 2, PoseGaussian(joined, CLOSURE), closure=True)
+    error = se2.between(beside, refine(hybrid_map, scans).arcs[0, 1].mean)
+    assert np.hypot(*error[:2]) < 0.03
+    assert np.degrees(abs(error[2])) < 0.5
+
+
 def test_the_closing_arc_is_far_more_certain_and_not_too_much_so_and_one_to_an_area_beside_as_before():
     squared = []
     for seed in range(8):
@@ -98,6 +118,37 @@ def test_along_a_bare_corridor_the_closing_arc_stays_uncertain():
     deviations = np.sqrt(np.diag(refine(hybrid_map, scans, (0, 1)).arcs[0, 1].covariance))
     assert deviations[0] == pytest.approx(0.2, rel=0.1)
     assert deviations[1] < 0.03
+
+
+def test_a_direction_that_a_pair_informs_of_next_to_nothing_keeps_the_uncertainty_of_the_motion():
+    """Along a corridor, noise of the normals leaves a pair of scans with hardly any information, which is dropped."""
+    walls, poses = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]]), np.zeros((2, 3))
+    poses[1, 0] = 0.5
+    options, motion = Configuration().refinement, np.diag([5.0, 5.0, 1.0]) ** 2
+    scans = [worlds.scan_in(walls, pose, noise=0.01, seed=k, beams=181) for k, pose in enumerate(poses)]
+    rows = np.array([[0, 1]])
+    (belief,) = relative_beliefs(
+        extract_surfaces(scans, 30.0, options.max_points),
+        poses,
+        ScanPairs(rows, np.full(1, options.min_share)),
+        Edges(*rows.T, poses[1:], motion[None]),
+        options,
+        rows,
+    )
+    deviations = np.sqrt(np.diag(belief.covariance))
+    assert deviations[0] == pytest.approx(5.0, rel=0.02)
+    assert deviations[1] < 0.1
+
+
+def test_where_scans_show_nothing_a_closing_arc_between_two_origins_is_as_certain_as_before():
+    """The keyframes at the origins carry it, although others stand there turned about."""
+    hybrid_map, nothing = HybridMap(), np.array([[500.0, 0.0, 500.0, 1.0]])
+    for k in range(4):
+        hybrid_map.set_keyframe(k, k // 2, np.array([0.0, 0.0, 3.0 * (k % 2)]))
+    hybrid_map.set_arc(0, 1, PoseGaussian(np.array([1.3, 0.2, 0.1]), CLOSURE), closure=True)
+    found = refine(hybrid_map, {k: worlds.scan_in(nothing, np.zeros(3)) for k in range(4)}, (0, 1)).arcs[0, 1]
+    np.testing.assert_allclose(found.mean, [1.3, 0.2, 0.1], atol=1e-9)
+    np.testing.assert_allclose(found.covariance, CLOSURE, atol=1e-6)
 
 
 def test_closures_far_from_each_other_are_refined_each_for_itself():

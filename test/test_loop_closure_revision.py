@@ -85,6 +85,15 @@ def test_closures_that_agree_raise_no_inconsistency():
     assert find_inconsistency(path, 82) is None
 
 
+def test_a_closure_contradicts_others_if_its_excess_is_above_the_bound():
+    path = drive_with((80, 6, 0, FALSE), (81, 7, 1, TRUE))
+    new = [path.closures[1].closure_id]
+    excess = ClosureConsistencyCheck(path, 0.0, 100).find_inconsistency(new, 0.01).excess_chi2
+    below = ClosureConsistencyCheck(path, np.nextafter(excess, 0.0), 100).find_inconsistency(new, 0.01)
+    assert below.excess_chi2 == excess
+    assert ClosureConsistencyCheck(path, excess, 100).find_inconsistency(new, 0.01) is None
+
+
 def test_a_false_closure_is_found_when_true_ones_contradict_it():
     """It fits the odometry alone."""
     path = drive_with((80, 6, 0, FALSE))

@@ -15,7 +15,7 @@ from hmt_slam_ros.places.observation_graph import QUARTERS, reverse_direction, s
 from hmt_slam_ros.places.place_graph import heading_of, node_of, opposite_direction, state_of
 from hmt_slam_ros.places.policy import metric_initial_pose
 from hmt_slam_ros.places.position_belief import PositionBelief, certain_belief
-from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covariance
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion, increment_covariance
 
 
 @pytest.fixture(scope="module")

@@ -67,6 +67,37 @@ def test_landmarks_speak_for_the_right_place_and_against_others(drive):
     assert abs(near - right) < 3.0
 
 
+class AllLandmarks(RelocalizationPrior):
+    """Leaves out no landmark of the map before it selects those within reach."""
+
+    def _landmarks_at(self, hybrid_map, before, placements, frame):
+        for area, pose in placements:
+            known = self._known_around(hybrid_map, area, before)
+            yield list(known.landmarks), se2.compose(se2.inverse(pose), known.poses)
+
+
+def test_a_landmark_counts_within_reach_along_the_axis_however_far_across_it_is(drive):
+    hybrid_map, scans, seen, before, true = drive
+    found = [make_candidate(se2.compose(true, np.array([shift, 0.0, 0.0]))) for shift in (0.0, 2.0)]
+    for reach in (0.5, 1.5):
+        changed = with_changes(CONFIGURATION, {"places.reach": reach})
+        views = AreaViewCache(LocalMapping(changed), scans)
+        near, everything = (
+            kind(changed, views).log_ratios(hybrid_map, seen, before, found)
+            for kind in (RelocalizationPrior, AllLandmarks)
+        )
+        np.testing.assert_allclose(near, everything, atol=1e-9)
+
+
+def test_landmarks_that_should_be_visible_and_are_not_speak_against_a_place(drive):
+    """Ground without landmarks, far from the map, has none to miss."""
+    hybrid_map, scans, seen, before, true = drive
+    shifts = ([100.0, 100.0, 0.0], [0.0, 2.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0])
+    found = [make_candidate(se2.compose(true, np.array(shift))) for shift in shifts]
+    bare, *others = place_prior(scans).log_ratios(hybrid_map, seen, before, found)
+    assert max(others) < bare - 1.0
+
+
 def test_what_speaks_against_places_weighs_them_with_an_exponent(drive):
     hybrid_map, scans, seen, before, true = drive
     prior = place_prior(scans)
@@ -124,6 +155,20 @@ def test_new_ground_looks_like_the_places_of_the_map(drive):
     ratios = place_prior(scans).log_ratios(only, seen, before, same)
     # All that is known of it are these two, of which it is one or the other with a probability of 0.9.
     assert np.exp(ratios).mean() < 1.0 / 0.9
+
+
+def test_a_map_of_places_that_all_fit_speaks_for_none_of_them(drive):
+    hybrid_map, scans, seen, before, true = drive
+    newest = se2.compose(true, seen[max(seen)])
+    keyframes = hybrid_map.keyframes(0)
+    near = sorted(keyframes, key=lambda k: np.abs(se2.between(newest, keyframes[k])).sum())[:2]
+    only = HybridMap()
+    for k in near:
+        only.set_keyframe(k, 0, keyframes[k])
+    same = [make_candidate(se2.compose(keyframes[k], se2.inverse(seen[max(seen)]))) for k in near]
+    ratios = place_prior(scans).log_ratios(only, seen, before, same)
+    # With the mean ratio m of the places against unknown ground, that against unmapped ground is m / (0.1 + 0.9 m).
+    assert 1.0 < np.exp(ratios).mean() < 1.0 / 0.9
 
 
 def test_without_a_landmark_or_a_place_nothing_changes(drive):

@@ -132,11 +132,13 @@ def test_a_node_of_it_answers_and_saves_its_part(with_row, listener, start, tmp_
     listener.until(lambda: len(notices) == 3)
     assert decode(notices[-1].data, Notice).text == "decisions: 3"
     listener.until(requests.get_subscription_count)
-    requests.publish(String(data=encode(SaveRequest(1, 3, str(tmp_path), shutdown=False))))
+    folder = tmp_path / ".map.partial-1" / "new"
+    folder.mkdir(parents=True)
+    requests.publish(String(data=encode(SaveRequest(1, 3, str(folder), shutdown=False))))
     listener.until(lambda: answers)
     answer = decode(answers[0].data, SaveResponse)
     assert (answer.process, answer.error) == (NAME, "")
-    assert (tmp_path / f"{NAME}.json").is_file()
+    assert (folder / f"{NAME}.json").is_file()
 
 
 def test_every_node_is_started_by_its_name():

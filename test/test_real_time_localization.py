@@ -12,7 +12,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import AreaPose
 from hmt_slam_ros.messages.messages import ClosureDecision, LocalEstimate, Notice
-from hmt_slam_ros.real_time_localization.rtl import Rtl
+from hmt_slam_ros.real_time_localization.rtl import CorrectionSmoother, Rtl
 from hmt_slam_ros.sensors import Odometry
 
 SECOND = 1_000_000_000
@@ -80,6 +80,16 @@ def test_the_map_pose_is_the_areas_pose_and_the_pose_in_the_area(rtl):
     assert np.linalg.eigvalsh(answer.map_pose.covariance - answer.pose_in_area.covariance).min() > 0
 
 
+def test_before_the_first_answer_the_map_frame_is_that_of_the_first_area(rtl):
+    for pose in (rtl.state.base_area_pose, *(each.pose for each in rtl.state.area_poses)):
+        np.testing.assert_array_equal(pose.mean, np.zeros(3))
+        np.testing.assert_array_equal(pose.covariance, np.zeros((3, 3)))
+    rtl.handle(odometry(0.0, 0, 0, 0))
+    rtl.handle(estimate(0.0, (1, 2, 0.5), (0, 0, 0)))
+    (answer,) = rtl.handle(odometry(0.1, 0, 0, 0))
+    np.testing.assert_allclose(answer.map_pose.mean, answer.pose_in_area.mean, atol=1e-12)
+
+
 def test_a_new_area_waits_for_its_place_in_the_map(rtl):
     rtl.handle(odometry(0.0, 0, 0, 0))
     rtl.handle(estimate(0.0, (0, 0, 0), (0, 0, 0)))
@@ -114,6 +124,20 @@ def test_the_uncertainty_grows_with_the_path_and_shrinks_with_the_next_estimate(
     assert np.linalg.det(rtl.handle(odometry(4, 4, 0, 0))[0].pose_in_area.covariance) < spread[1]
 
 
+def test_the_map_pose_has_the_ambiguity_of_the_newest_decision(rtl):
+    def answer(seconds):
+        return rtl.handle(odometry(seconds, 0, 0, 0))[0].map_pose.covariance
+
+    rtl.handle(make_decision(a0=(0, 0, 0)))
+    rtl.handle(odometry(0.0, 0, 0, 0))
+    rtl.handle(estimate(0.0, (0, 0, 0), (0, 0, 0)))
+    alone = answer(0.1)
+    for seconds, factor in ((0.2, 1.0), (0.3, 0.25)):
+        ambiguity = factor * np.array([[4.0, 1.0, 0.2], [1.0, 3.0, 0.1], [0.2, 0.1, 0.5]])
+        rtl.handle(ClosureDecision(0, ambiguity=ambiguity))
+        np.testing.assert_allclose(answer(seconds) - alone, ambiguity, atol=1e-12)
+
+
 def test_driving_to_and_fro_does_not_make_the_robot_sure_again(rtl):
     rtl.handle(odometry(0, 0, 0, 0))
     rtl.handle(estimate(0, (0, 0, 0), (0, 0, 0)))
@@ -133,6 +157,24 @@ def test_an_odometry_reset_is_reported_once_and_the_robot_stays_where_it_was(rtl
     assert "41.23 m" in notice.text
     assert np.allclose(answer.pose_in_area.mean, (2, 0, 0))
     assert np.allclose(later.pose_in_area.mean, (2.2, 0, 0))
+
+
+def test_a_reset_is_no_path(rtl):
+    rtl.handle(odometry(0.0, 0, 0, 0))
+    rtl.handle(estimate(0.0, (2, 0, 0), (0, 0, 0)))
+    (before,) = rtl.handle(odometry(1.0, 1.5, 0, 0.2))
+    _, after = rtl.handle(odometry(1.1, 60, 0, 0))
+    np.testing.assert_array_equal(after.pose_in_area.covariance, before.pose_in_area.covariance)
+
+
+def test_a_correction_decays_exponentially():
+    smoother, here = CorrectionSmoother(), np.array([4.0, 1.0, 0.3])
+    before, after = np.zeros(3), np.array([0.3, -0.1, 0.0])
+    np.testing.assert_array_equal(smoother.smooth(0, before, here, 2.0), before)
+    for seconds in (0.5, 1.0, 3.0):
+        found = smoother.smooth(round(seconds * SECOND), after, here, 2.0)
+        np.testing.assert_allclose(found, (1.0 - math.exp(-seconds / 2.0)) * after, atol=1e-9)
+    np.testing.assert_allclose(smoother.smooth(4 * SECOND, before, here, 0.0), before)
 
 
 def test_an_estimate_from_before_a_reset_still_serves(rtl):

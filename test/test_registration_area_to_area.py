@@ -1,20 +1,20 @@
 """Area matching: the search against brute force, modes, evidence."""
 
-import itertools
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2, multivariate_normal
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.registration import match_modes
+from hmt_slam_ros.registration import area_to_area, match_modes
 from hmt_slam_ros.registration.area_to_area import MatchSettings, match_areas
-from hmt_slam_ros.registration.branch_and_bound import SearchCells, constrain_around, search_cells
-from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid
-from hmt_slam_ros.registration.search_bounds import LogRatioGrid, make_search_window
+from hmt_slam_ros.registration.branch_and_bound import SearchCells, constrain_around
+from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid
+from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 
 MODEL = GridModel()
 SETTINGS = MatchSettings()
@@ -53,53 +53,6 @@ def visit():
 def prior_around(truth, sigma, degrees, offset=(0.6, -0.8, 0.5)):
     spread = np.array([sigma, sigma, math.radians(degrees)])
     return PoseGaussian(se2.compose(truth, spread * offset), np.diag(spread**2))
-
-
-def brute_force(window, surface, samples, back, back_samples, temper):
-    """Score of every cell within the gate, one by one: {(k, i, j): score}."""
-
-    def reads(surface, points, only_negative):
-        cells = np.floor((points - surface.origin) / surface.cell).astype(int)
-        inside = np.all((cells >= 0) & (cells < surface.log_ratio.shape[::-1]), axis=1)
-        values = surface.log_ratio[cells[inside, 1], cells[inside, 0]].astype(float)
-        return np.minimum(values, 0.0).sum() if only_negative else values.sum()
-
-    scores = {}
-    (left, low), (right, high) = window.first, window.last
-    spans = range(window.turns.size), range(left, right + 1), range(low, high + 1)
-    for k, i, j in itertools.product(*spans):
-        pose = window.mean + np.array([i * window.cell, j * window.cell, window.turns[k]])
-        twist = se2.log(se2.between(window.mean, pose))
-        exponent = float(np.sum((window.information_root @ twist) ** 2))
-        if exponent <= window.gate:
-            forward = reads(surface, se2.transform(pose, samples), False)
-            backward = reads(back, se2.transform(se2.inverse(pose), back_samples), True)
-            scores[k, i, j] = temper * (forward + backward) - 0.5 * exponent
-    return scores
-
-
-@pytest.mark.parametrize("bounded", [False, True])
-@pytest.mark.parametrize("seed", range(12))
-def test_the_search_finds_exactly_the_cells_that_brute_force_finds(seed, bounded):
-    rng = np.random.default_rng(seed)
-    grids = [rng.normal(size=(rng.integers(8, 40), rng.integers(8, 40))).astype(np.float32) for _ in range(2)]
-    surface, back = (
-        LogRatioGrid(g, rng.uniform(-2.5, -1.0, 2), cell) for g, cell in zip(grids, (0.1, 0.13), strict=True)
-    )
-    samples, back_samples = rng.uniform(-1.5, 1.5, (25, 2)), rng.uniform(-1.5, 1.5, (20, 2))
-    root = rng.normal(size=(3, 3)) * [[0.25], [0.25], [0.15]]
-    mean, bounds = rng.uniform(-1.0, 1.0, 3), np.array([[-0.6, -1.2], [0.9, 0.5]])
-    window = make_search_window(mean, root @ root.T + 1e-4 * np.eye(3), 0.1, 0.05, 9.0, bounds if bounded else None)
-    expected = brute_force(window, surface, samples, back, back_samples, 0.5)
-    best = max(expected.values())
-    expected = {cell: score for cell, score in expected.items() if score >= best - 4.0}
-    found = search_cells(window, surface, samples, back, back_samples, 0.5, -100.0, 4.0)
-    scores = {tuple(cell): score for cell, score in zip(found.indices.tolist(), found.score, strict=True)}
-    # A sample within rounding of a cell's edge may be read one cell off.
-    shared = scores.keys() & expected.keys()
-    assert len(shared) >= 0.97 * max(len(scores), len(expected))
-    differences = np.array([abs(scores[cell] - expected[cell]) for cell in shared])
-    assert np.mean(differences < 1e-5) > 0.97
 
 
 def test_poses_where_no_keyframe_is_on_the_ground_are_not_searched(known_area, visit):
@@ -170,6 +123,49 @@ def test_the_evidence_is_the_mean_of_the_likelihood_over_the_prior(known_area, v
     found = match_areas(visit, known_area, prior, SETTINGS).log_evidence
     # The reverse check, which the samples leave out, can only lower it.
     assert expected - 1.5 < found < expected + 0.2
+
+
+@pytest.mark.parametrize(
+    "root", [np.diag([0.3, 0.2, 0.1]), np.array([[0.3, 0.0, 0.0], [0.1, 0.2, 0.0], [0.05, -0.03, 0.1]])]
+)
+def test_where_nothing_is_known_the_prior_stands(visit, root):
+    coarse, fine = (np.zeros((size, size), np.float32) for size in (100, 200))
+    blank = AreaGrid(np.array([-10.0, -10.0]), 0.1, coarse, fine, coarse > 0.0, np.array([[-9.5, -9.5]]))
+    prior = PoseGaussian(np.array([0.5, -0.3, 0.8]), root @ root.T)
+    found = match_areas(visit, blank, prior, SETTINGS)
+    assert found.log_evidence == pytest.approx(math.log(chi2.cdf(SETTINGS.gate, 3)), abs=0.03)
+    (mode,) = found.modes
+    assert mode.log_mass == found.log_evidence
+    np.testing.assert_allclose(mode.pose.mean, prior.mean, atol=0.005)
+    floor = np.diag([0.01, 0.01, math.radians(0.2)]) ** 2
+    scale = np.sqrt(np.outer(*[np.diag(prior.covariance)] * 2))
+    np.testing.assert_allclose((mode.pose.covariance - prior.covariance - floor) / scale, 0.0, atol=0.03)
+    # Without the prior, a hundredth of its information is left.
+    np.testing.assert_allclose((mode.measured.covariance - 100.0 * prior.covariance) / scale, 0.0, atol=3.0)
+
+
+@pytest.mark.parametrize(("margin", "is_found"), [(0.5, True), (-0.5, False)])
+def test_where_no_pose_can_have_a_hundred_thousandth_of_the_mass_there_is_no_evidence(visit, margin, is_found):
+    root = np.diag([1.5, 1.0, 0.4])
+    prior = PoseGaussian(np.array([0.5, -0.3, 0.8]), root @ root.T)
+    turn = area_to_area._turn_step(0.1, visit.points - visit.points.mean(axis=0))
+    log_share = math.log(0.1**2 * turn * multivariate_normal(np.zeros(3), prior.covariance).pdf(np.zeros(3)))
+    score = math.log(1e-5) - log_share + margin
+    assert score < 0.0
+    coarse, fine = (
+        np.full((size, size), score / len(visit.points) / SETTINGS.temper, np.float32) for size in (300, 600)
+    )
+    alike = AreaGrid(np.array([-15.0, -15.0]), 0.1, coarse, fine, coarse > 0.0, np.array([[-14.5, -14.5]]))
+    assert math.isfinite(match_areas(visit, alike, prior, SETTINGS).log_evidence) == is_found
+
+
+def test_a_turn_moves_nine_samples_of_ten_by_a_cell_at_most():
+    samples = np.random.default_rng(7).uniform(-9.0, 9.0, (500, 2))
+    turn = area_to_area._turn_step(0.1, samples)
+    moved = np.hypot(*(se2.transform((0.0, 0.0, turn), samples) - samples).T)
+    assert np.quantile(moved, 0.9) == pytest.approx(0.1)
+    assert area_to_area._turn_step(0.1, 0.1 * samples) == math.radians(2.0)
+    assert area_to_area._turn_step(0.1, 100.0 * samples) == math.radians(0.2)
 
 
 def test_a_wider_prior_costs_evidence(known_area, visit):

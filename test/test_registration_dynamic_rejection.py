@@ -9,7 +9,7 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.registration.dynamic_rejection import reject_dynamic
 from hmt_slam_ros.registration.scan_to_map import Prior
-from hmt_slam_ros.sensors.motion_model import RelativeMotion, increment_covariance
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion, increment_covariance
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 
 STEP = np.array([0.12, 0.0, 0.0])

@@ -1,10 +1,13 @@
 """The grid of log-likelihood ratios around an area."""
 
+import itertools
+
 import numpy as np
 import pytest
 from worlds import box, scan_in
 
-from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid, thin_points
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid, thin_points
 
 ROOM = box(0.0, 0.0, 6.0, 4.0)
 MODEL = GridModel()
@@ -82,10 +85,86 @@ def test_a_moved_grid_gives_the_same_in_the_same_place(room):
     assert log_ratio_at(moved, 5.0, 4.0) == log_ratio_at(room, 6.0, 2.0)
 
 
-def test_a_surface_on_the_edge_of_what_beams_passed_contradicts_nothing_and_one_amid_it_does():
-    # Sees from straight ahead to the right: whatever stands on the line ahead is grazed.
-    ahead = scan_in(box(-9.0, -9.0, 9.0, 9.0), (0.0, 0.0, -np.pi / 4), beams=181, field_of_view=np.pi / 2)
-    grid = build_area_grid([ahead], np.array([[0.0, 0.0, -np.pi / 4]]), GridModel())
+@pytest.mark.parametrize("quarters", range(4))
+@pytest.mark.parametrize("side", [-1.0, 1.0], ids=["right", "left"])
+def test_a_surface_on_the_edge_of_what_beams_passed_contradicts_nothing_and_one_amid_it_does(quarters, side):
+    # Sees from straight ahead to one side: whatever stands on the line ahead is grazed.
+    ahead = 0.5 * np.pi * quarters
+    # The line is in the middle of cells.
+    pose = np.array([*se2.transform((0.0, 0.0, ahead), np.array([0.0, side * 0.05])), ahead + side * np.pi / 4])
+    seen = scan_in(box(-9.0, -9.0, 9.0, 9.0), pose, beams=181, field_of_view=np.pi / 2)
+    grid = build_area_grid([seen], pose[None], GridModel())
     along = np.column_stack((np.arange(2.0, 7.0, 0.2), np.zeros(25)))
-    for aside, free in ((-0.02, 0), (-0.08, 0), (-0.5, 25)):
-        assert grid.compare(along + np.array([0.0, aside]), np.zeros(3)) == (25, 0, free)
+    for aside, free in ((0.02, 0), (0.08, 0), (0.5, 25)):
+        points = along + np.array([0.0, side * (0.05 + aside)])
+        assert grid.compare(points, np.array([0.0, 0.0, ahead])) == (25, 0, free)
+
+
+def test_the_points_of_voxels_are_the_means_of_those_within():
+    points = np.random.default_rng(2).uniform(-2.0, 1.0, (300, 2)) * [1.0, 2.5]
+    voxels = {}
+    for point in points:
+        voxels.setdefault(tuple(np.floor(point / 0.3).astype(int)), []).append(point)
+    np.testing.assert_allclose(thin_points(points, 0.3), [np.mean(voxels[key], axis=0) for key in sorted(voxels)])
+
+
+def test_agreement_counts_samples_on_surfaces_and_amid_free_space():
+    rng = np.random.default_rng(6)
+    fine = np.where(rng.random((24, 30)) < 0.8, -1.0, rng.uniform(-0.5, 1.0, (24, 30))).astype(np.float32)
+    grid = AreaGrid(np.array([-1.0, 0.5]), 0.2, fine[::2, ::2], fine, fine[::2, ::2] < 0.0, np.zeros((0, 2)))
+    points, pose = rng.uniform([-1.5, -1.5], [2.5, 2.0], (400, 2)), np.array([0.3, 1.5, 0.4])
+    cells = np.floor((se2.transform(pose, points) - grid.origin) / 0.1).astype(int)
+    inside = [(c, r) for c, r in cells if 3 <= c < 27 and 3 <= r < 21]
+    free = [all(fine[r + y, c + x] < -0.5 for x, y in ((0, 0), (3, 0), (-3, 0), (0, 3), (0, -3))) for c, r in inside]
+    expected = (400, sum(fine[r, c] > 0.3 for c, r in inside), sum(free))
+    assert grid.compare(points, pose) == expected
+    assert min(expected) > 5
+
+
+def plain_log_ratios(scans, poses, model, grid):
+    """The log-ratio in the middle of each half cell, from the distances to all end points and the cells on beams."""
+    half, (rows, columns) = 0.5 * model.cell, grid.fine_log_ratio.shape
+    x, y = (grid.origin[k] + half * (np.arange(size) + 0.5) for k, size in enumerate((columns, rows)))
+    distance2, free = np.full((rows, columns), np.inf), np.zeros((rows // 2, columns // 2), bool)
+    for scan, pose in zip(scans, poses, strict=True):
+        near = np.hypot(*(scan.points - scan.origins).T) <= model.max_range
+        ends, laser = se2.transform(pose, scan.points[near]), se2.transform(pose, scan.origins[near][0])
+        for end in ends:
+            steps = int(np.ceil(np.abs((end - laser) / model.cell).max()))
+            way = laser + (end - laser) * np.arange(steps - 1)[:, None] / steps
+            free[tuple(np.floor((way - grid.origin) / model.cell).astype(int).T[::-1])] = True
+        surface = [ends[-1:]]
+        for one, other in itertools.pairwise(ends):
+            length = np.hypot(*(other - one))
+            count = int(np.ceil(length / half)) if length <= 0.3 else 1
+            surface.append(one + (other - one) * np.arange(count)[:, None] / count)
+        for px, py in np.concatenate(surface):
+            # Up to five deviations, in whole cells, from the cell nearest to the point.
+            reach = half * (np.ceil(5.0 * model.sigma / half) + 0.5)
+            nearest_x, nearest_y = x[np.abs(x - px).argmin()], y[np.abs(y - py).argmin()]
+            reached = (np.abs(x - nearest_x) < reach)[None] & (np.abs(y - nearest_y) < reach)[:, None]
+            own = (x - px)[None] ** 2 + (y - py)[:, None] ** 2
+            distance2 = np.where(reached, np.minimum(distance2, own), distance2)
+    free = np.kron(free, np.ones((2, 2))) > 0.0
+    near = np.exp(-0.5 * distance2 / model.sigma**2)
+    away = np.where(free, 1.0 + (model.free_ratio - 1.0) * (1.0 - near**0.25), 1.0)
+    values = np.log(away + (model.surface_ratio - away) * np.where(near >= 1e-3, near, 0.0))
+    return np.where(~free & (distance2 > 14.0 * model.sigma**2), 0.0, values)
+
+
+def test_the_log_ratios_are_those_of_distances_and_beams():
+    model = GridModel(cell=0.1, sigma=0.08, surface_ratio=4.0, free_ratio=0.2, max_range=4.0)
+    poses = np.array([[2.0, 2.0, 0.3], [3.1, 1.4, 2.9]])
+    scans = [scan_in(ROOM, pose, beams=91, field_of_view=4.0, laser_pose=(0.2, -0.1, 0.4)) for pose in poses]
+    grid = build_area_grid(scans, poses, model)
+    np.testing.assert_allclose(grid.origin / model.cell, np.round(grid.origin / model.cell), atol=1e-9)
+    expected = plain_log_ratios(scans, poses, model, grid)
+    off = np.abs(grid.fine_log_ratio - expected) > 1e-4
+    # Beams along the edge of a cell may be rounded to either side, and distances at the limit of the reach.
+    assert off.mean() < 0.001
+    ends = np.concatenate([se2.transform(pose, scan.points) for pose, scan in zip(poses, scans, strict=True)])
+    ends = ends[np.hypot(*(ends - grid.points.mean(axis=0)).T) < 4.0]
+    corner = grid.origin + model.cell * np.array(grid.free.shape[::-1])
+    assert (grid.points.min(axis=0) - grid.origin >= 5.0 * model.sigma).all()
+    assert (corner - grid.points.max(axis=0) >= 5.0 * model.sigma).all()
+    assert (corner - grid.points.max(axis=0) <= 5.0 * model.sigma + 2.0 * model.cell + model.spacing).all()

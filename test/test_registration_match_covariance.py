@@ -8,7 +8,8 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.registration.match_covariance import estimate_match_error
-from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
+from hmt_slam_ros.sensors.motion_model import Prediction
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.particle_filter import ParticleFilter
 

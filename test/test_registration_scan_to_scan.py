@@ -19,7 +19,11 @@ from hmt_slam_ros.loop_closure.joint_refinement import (
     refine_jointly,
     scan_pairs,
 )
-from hmt_slam_ros.registration.scan_to_scan import extract_surfaces, normal_equations, weighting_from_options
+from hmt_slam_ros.registration.scan_to_scan import (
+    extract_surfaces,
+    normal_equations,
+    weighting_from_options,
+)
 from hmt_slam_ros.results.final_map import register_scans
 
 OPTIONS = RefinementParameters()

@@ -7,7 +7,7 @@ from worlds import box, scan_in
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.motion_model import increment_covariance
+from hmt_slam_ros.sensors.relative_motion import increment_covariance
 
 
 def test_only_beams_with_a_return_become_points():

@@ -6,8 +6,9 @@ import pytest
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Odometry
-from hmt_slam_ros.sensors.motion_model import Inertia, MotionModel, OdometryNoise, RelativeMotion, increment_covariance
+from hmt_slam_ros.sensors.motion_model import Inertia, MotionModel, OdometryNoise
 from hmt_slam_ros.sensors.odometry import OdometryBuffer
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion, increment_covariance
 
 SECOND = 10**9
 SHARP = np.diag([1e4, 1e4, 1e6])

@@ -6,7 +6,7 @@ import pytest
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensors.motion_model import NO_MOTION, RelativeMotion, increment_covariance
+from hmt_slam_ros.sensors.relative_motion import NO_MOTION, RelativeMotion, increment_covariance
 from hmt_slam_ros.simulation import FAMILIES, open_simulated
 from hmt_slam_ros.simulation.building import Building, furniture_walls, outline_of_rectangles
 from hmt_slam_ros.simulation.laser import cast_rays, clearance, has_line_of_sight

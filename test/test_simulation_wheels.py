@@ -7,7 +7,7 @@ import pytest
 
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.sensors.motion_model import NO_MOTION, RelativeMotion, increment_covariance
+from hmt_slam_ros.sensors.relative_motion import NO_MOTION, RelativeMotion, increment_covariance
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.simulation.drive import draw_slips, integrate_increments, noisy_increments
 

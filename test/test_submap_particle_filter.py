@@ -9,7 +9,8 @@ from worlds import blank_scan, box, scan_in
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.registration.scan_to_map import matched_fraction
-from hmt_slam_ros.sensors.motion_model import Prediction, RelativeMotion
+from hmt_slam_ros.sensors.motion_model import Prediction
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.particle_filter import ParticleFilter

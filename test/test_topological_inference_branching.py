@@ -4,9 +4,11 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from worlds import box, scan_in
 
-from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.configuration import Configuration, with_changes
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.replica import Replica
@@ -182,14 +184,50 @@ def test_keyframes_most_of_which_are_in_its_place_are_recognized():
     assert max(branches.children, key=lambda child: child.log_weight).area == 0
 
 
+PILLARS = np.concatenate(
+    (box(-80.0, 1.2, 80.0, 3.4), *(box(x, 3.0, x + 0.3, 3.4) for x in np.arange(-39.0, 45.0, 1.2)))
+)
+"""A hall of equal pillars, 1.2 m apart."""
+
+
+@pytest.mark.parametrize("prior", [False, True])
+def test_configured_landmarks_have_to_be_given(prior):
+    configuration = with_changes(Configuration(), {"places.prior": prior})
+    assert Branching(configuration, Replica(), lambda *_: None).landmarks is None
+    if prior:
+        with pytest.raises(HmtSlamError, match=r"places\.prior and places\.loops need landmarks"):
+            Branching(configuration, Replica())
+    else:
+        assert Branching(configuration, Replica()).landmarks is None
+
+
+def test_a_scan_that_fits_in_several_ways_is_measured_by_the_heaviest():
+    parent, branching, newest = rooms_apart((PILLARS, PILLARS), ((0.3, 0.1),), 0.8)
+    truth = se2.between(PATH[0], PATH[5])
+    prior = PoseGaussian(truth, np.diag([0.8, 0.8, math.radians(5.0)]) ** 2)
+    scan = branching._replica.scans[newest[-1]]
+    measured = branching.search.measure_pose(parent.hybrid_map, 0, parent.area, scan, prior)
+    np.testing.assert_allclose(measured.mean, truth, atol=0.1)
+
+
+def test_the_only_way_to_fit_has_all_the_probability_of_the_place_whatever_its_mass():
+    """The exponent of the surface likelihood changes the mass, but not the evidence."""
+    weights = []
+    for temper in (0.1, 0.3):
+        settings = Configuration()
+        settings = replace(settings, tsbi=replace(settings.tsbi, temper=temper))
+        parent, branching, newest = rooms_apart((ROOM, ROOM), ((0.2, -0.1),), 0.5, settings)
+        (weight,) = [child.log_weight for child in branching.cut(parent, newest[1:]).children if child.area == 0]
+        weights.append(weight)
+    assert weights[0] == pytest.approx(weights[1], abs=0.2)
+
+
 def test_further_ways_to_fit_into_an_area_count_as_not_examined():
-    pillars = [box(x, 3.0, x + 0.3, 3.4) for x in np.arange(-39.0, 45.0, 1.2)]
-    hall = np.concatenate((box(-80.0, 1.2, 80.0, 3.4), *pillars))
     weights, skipped = {}, {}
     for most in (1, 6):
         settings = Configuration()
         settings = replace(settings, tsbi=replace(settings.tsbi, max_modes=most, temper=0.03))
-        parent, branching, newest = rooms_apart((hall, hall), ((0.3, 0.1),), 0.8, settings)
+        parent, branching, newest = rooms_apart((PILLARS, PILLARS), ((0.3, 0.1),), 0.8, settings)
         branches = branching.cut(parent, newest[1:])
         weights[most] = [math.exp(child.log_weight) for child in branches.children if child.area == 0]
         skipped[most] = math.exp(branches.log_skipped_weight)

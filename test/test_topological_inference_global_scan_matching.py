@@ -12,6 +12,7 @@ from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import GridCache, Neighborhood
 from hmt_slam_ros.registration.area_to_area import MatchSettings
 from hmt_slam_ros.registration.likelihood_grid import GridModel
+from hmt_slam_ros.topological_inference import global_scan_matching
 from hmt_slam_ros.topological_inference.global_scan_matching import FreeSpaceCheck, GlobalScanMatcher, regions
 
 REACH = 6.0
@@ -148,3 +149,17 @@ def test_areas_are_searched_together_where_they_lie_for_certain_beside_each_othe
     assert all(part.own_areas <= part.poses.keys() for part in found)
     if count == 2:
         assert found[0].poses.keys() == {0, 1, 2, 3, 4}
+
+
+def test_a_later_region_needs_the_mean_log_ratio_of_a_share_0_15_below_the_best(match, monkeypatch):
+    """A known surface makes a sample three times as likely; half of the samples have to be on one at least."""
+    required, search = [], global_scan_matching.match_areas
+
+    def record_search(query, candidate, prior, settings, *constraints):
+        required.append(settings.min_log_ratio)
+        return search(query, candidate, prior, settings, *constraints)
+
+    monkeypatch.setattr(global_scan_matching, "match_areas", record_search)
+    best_share = max(fit.agreement.matched_share for fit in match([0, 1]) if fit.area == 0)
+    assert best_share > 0.9
+    assert required == pytest.approx([0.5 * np.log(3.0), (best_share - 0.15) * np.log(3.0)])

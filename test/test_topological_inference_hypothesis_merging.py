@@ -61,9 +61,10 @@ def test_known_ground_is_a_placement_of_its_own():
     assert not recognized.is_equivalent(tracked)
 
 
-def with_another_loop(hypothesis, covariance=SHARP):
-    """The same with an arc from the robot's area to area 2."""
-    hypothesis.hybrid_map.set_arc(hypothesis.area, 2, PoseGaussian(2.0 * STEP, covariance), closure=True)
+def with_another_loop(hypothesis, covariance=SHARP, offset=(0.0, 0.0, 0.0)):
+    """The same with an arc from the robot's area to area 2, which is off by ``offset``."""
+    arc = PoseGaussian(2.0 * STEP + np.array(offset), covariance)
+    hypothesis.hybrid_map.set_arc(hypothesis.area, 2, arc, closure=True)
     return hypothesis
 
 
@@ -81,6 +82,25 @@ def test_a_loop_that_one_hypothesis_closes_by_two_arcs_and_one_by_the_second_is_
         hypothesis.hybrid_map.set_arc(1, 2, PoseGaussian(STEP, SHARP), closure=False)
     assert direct.is_equivalent(around)
     assert around.is_equivalent(direct)
+
+
+@pytest.mark.parametrize(("distance", "same"), [(0.3, True), (1.0, False)])
+@pytest.mark.parametrize("direction", [0.0, 0.5 * np.pi, 2.5])
+def test_closures_of_the_same_areas_are_equivalent_as_far_as_alignment_moves_arcs_in_any_direction(
+    distance, direction, same
+):
+    offset = (distance * np.cos(direction), distance * np.sin(direction), 0.0)
+    one = with_another_loop(enter_known_area(0, POSE))
+    other = with_another_loop(enter_known_area(0, POSE), offset=offset)
+    assert one.is_equivalent(other) == other.is_equivalent(one) == same
+
+
+def test_a_closure_with_an_area_that_only_one_hypothesis_has_does_not_distinguish_the_two():
+    without, has = enter_known_area(0, POSE), enter_known_area(0, POSE)
+    has.hybrid_map.set_keyframe(9, 9, np.zeros(3))
+    has.hybrid_map.set_arc(9, 1, PoseGaussian(STEP, SHARP), closure=True)
+    assert without.is_equivalent(has)
+    assert has.is_equivalent(without)
 
 
 def test_uncertain_poses_imply_no_closure():

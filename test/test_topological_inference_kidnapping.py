@@ -15,8 +15,12 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.messages.messages import AreaEvents, Keyframe, PrunedKeyframe
+from hmt_slam_ros.registration.area_to_area import MatchMode
+from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.topological_inference import relocalization
-from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
+from hmt_slam_ros.topological_inference.global_localization import UNMAPPED_PRIOR, PoseDistribution
+from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
 from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, HypothesisState, Lost, PoseInArea, Tracking
 from hmt_slam_ros.topological_inference.relocalization import (
     KIDNAPPED_UNMAPPED_PRIOR,
@@ -105,6 +109,32 @@ def test_without_mapping_it_moves_to_the_area_of_its_relocalization(mapping, are
     (hypothesis,) = run.keyframe(poses[-1], mapping=mapping).hypotheses
     assert hypothesis.area == area
     assert run.tsbi.state.hypothesis_states[0].localization.relocalized_area is None
+
+
+def test_it_is_searched_in_the_map_from_before_the_kidnapping(monkeypatch):
+    searches, search = [], ClosureSearch.localize_globally
+
+    def record_search(closure_search, hybrid_map, poses, before, *others):
+        searches.append((before, sorted(poses)))
+        return search(closure_search, hybrid_map, poses, before, *others)
+
+    monkeypatch.setattr(ClosureSearch, "localize_globally", record_search)
+    spawn((ROOM, OTHER, ROOM), {2: 8.0})
+    assert searches == [(14, [14, 15, 16, 17])]
+
+
+@pytest.mark.parametrize(("is_kidnapped", "probability"), [(False, 0.8), (True, 0.5)])
+def test_unmapped_ground_is_as_probable_as_the_map_for_a_kidnapped_robot_alone(is_kidnapped, probability, monkeypatch):
+    """Scans that fit a place as well as unmapped ground leave the prior as it is."""
+    parent, branching, newest = rooms_apart((ROOM, OTHER), [FAR], 0.1)
+    vague = PoseGaussian(np.zeros(3), np.eye(3))
+    candidate = PoseCandidate(0, MatchMode(vague, vague, 0.0), Agreement(0, 0, 0))
+    found = PoseDistribution((candidate,), np.array([1.0 - UNMAPPED_PRIOR]))
+    monkeypatch.setattr(ClosureSearch, "localize_globally", lambda *_: found)
+    tracked_pose = PoseInArea(1, newest[0], np.zeros(3)) if is_kidnapped else None
+    state = replace(parent.state, localization=Lost(newest[0], tracked_pose=tracked_pose, counted_evidence=None))
+    branches = relocalization.update_relocalization(branching, replace(parent, state=state))
+    assert branches.pose_distribution.probabilities.tolist() == pytest.approx([probability])
 
 
 def test_on_unmapped_ground_only_the_cusum_statistic_counts():
@@ -201,6 +231,38 @@ def test_a_false_alarm_raises_the_probability_of_the_tracked_pose_only(at, found
     assert (branches[0.4] > branches[0.0]) == found
 
 
+@pytest.mark.parametrize("joined", [True, False])
+def test_a_new_area_is_drawn_at_the_initial_pose_in_the_frame_of_the_area_before(joined):
+    """Where no arcs lead to the area of the initial pose, its frame is taken for that of the area before."""
+    parent, branching, newest = rooms_apart((ROOM, OTHER), [FAR] if joined else [], 0.1)
+    pose = np.array([1.0, -0.5, 0.7])
+    keyframe = Keyframe(
+        newest[-1],
+        branching._replica.scans[newest[-1]],
+        1.0,
+        (),
+        motion_unknown=True,
+        initial_pose=InitialPose(0, PoseGaussian(pose, 0.1 * np.eye(3))),
+    )
+    (child,) = relocalization.begin_relocalization(branching, parent, keyframe, PATH[3]).children
+    (arc,) = child.arcs
+    assert (arc.source, arc.target) == (1, 2)
+    assert is_uninformative(arc.pose)
+    frame = np.array([*FAR, 0.0]) if joined else np.zeros(3)
+    np.testing.assert_allclose(arc.pose.mean, se2.compose(frame, pose), atol=1e-9)
+
+
+@pytest.mark.parametrize(("since", "reset"), [(0, False), (6, False), (7, True)])
+def test_tracking_is_reset_only_where_the_robot_is_lost_from_the_next_event_on(since, reset):
+    run, poses = Run(RING), ring_drive(7)
+    for pose in poses[:-1]:
+        run.keyframe(pose)
+    lost = replace(run.tsbi.state.hypothesis_states[0], unmatched_keyframes=(), localization=Lost(since))
+    run.tsbi._state = replace(run.tsbi._state, hypothesis_states={0: lost})
+    (hypothesis,) = run.keyframe(poses[-1]).hypotheses
+    assert (hypothesis.lost, hypothesis.tracking_reset) == (True, reset)
+
+
 def test_an_initial_pose_replaces_the_false_alarm():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
     alarm = FalseAlarm(PoseInArea(1, newest[0], np.zeros(3)), 0.4)
@@ -269,6 +331,11 @@ def test_an_inconsistency_passes_with_scans_that_fit():
 
 def test_small_contradictions_before_the_onset_do_not_count():
     assert HypothesisState().after_scan(5, 2.0).after_scan(6, 9.0).after_scan(7, 6.0).kidnapping_test(1e-5)[1] == 6
+
+
+def test_a_fifth_of_the_largest_evidence_can_be_the_onset_and_less_cannot():
+    evidence = {4: 1.999, 5: 2.0, 6: 10.0}
+    assert HypothesisState(kidnapping_evidence=evidence).kidnapping_test(1e-5) == (pytest.approx(PRIOR + 12.0), 5)
 
 
 def test_keyframes_of_a_kidnapped_robot_are_not_pruned_at_the_same_event():

@@ -60,3 +60,12 @@ def test_descriptors_share_the_probability_among_areas(descriptors):
 def test_more_similarity_than_the_median_is_evidence_for_an_area():
     ratios = descriptor_log_ratio(np.array([-1.0, 0.0, 1.0]))
     assert ratios[0] < ratios[1] == RATIO_AT_MEDIAN < 0.0 < ratios[2]
+
+
+def test_the_similarity_is_that_of_the_mean_distance_to_the_nearest_descriptor(descriptors):
+    query, areas = [2, 9, 4], [(3, 5), (0, 1), (6, 7, 8), (1, 8)]
+    known = {k: describe_scan(descriptors._scans[k]) for k in range(10)}
+    distances = [np.mean([min(np.abs(known[q] - known[k]).mean() for k in area) for q in query]) for area in areas]
+    np.testing.assert_allclose(
+        descriptors.similarity(query, areas), np.median(np.log(distances)) - np.log(distances), rtol=1e-9
+    )

@@ -83,6 +83,19 @@ def test_the_bound_from_positions_alone_is_a_bound_and_zero_where_nothing_is_nea
     assert bound == 0.0 or x < 9.0 or sigma > 0.05
 
 
+@pytest.mark.parametrize("known", [(1.6, 1.2), (1.2, -1.6), (2.4, 2.0), (-0.5, -0.5)])
+def test_the_sampled_bound_is_that_of_draws_from_a_correlated_belief(known):
+    root = np.array([[1.0, 0.0, 0.0], [0.8, 0.5, 0.0], [0.3, -0.2, 0.25]])
+    prior = PoseGaussian(np.array([0.5, -0.2, 0.7]), root @ root.T)
+    poses = np.array([[0.0, 0.0, 0.0], [2.0, 0.5, 0.3]])
+    drawn = np.random.default_rng(3).standard_normal((40_000, 3)) @ root.T
+    references = se2.compose(prior.mean, se2.exp(drawn))
+    away = [np.hypot(*(se2.compose(references, pose)[:, :2] - known).T) for pose in poses]
+    share = np.mean(np.minimum(*away) <= 1.0)
+    assert 0.05 < share < 0.95
+    assert sampled_entry_bound(np.array([known]), prior, poses, 1.0) == pytest.approx(share, abs=0.02)
+
+
 def test_a_loose_prior_spreads_over_the_place_and_what_lies_around(corridor):
     share = entry_prior(corridor, belief(3.0, 10.0), keyframes(1.0), RADIUS).probability
     assert 0.02 < share < 0.6
@@ -167,3 +180,16 @@ def test_the_quick_bound_is_one_on_the_probability_of_an_area_far_from_certain(a
     poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     exact = sampled_entry_bound(np.zeros((1, 2)), PoseGaussian(prior.mean, 1.5**2 * prior.covariance), poses, 2.0)
     assert exact <= bound <= max(10.0 * exact, 0.01)
+
+
+@pytest.mark.parametrize("direction", [0.0, 0.5 * math.pi, 2.0])
+def test_the_quick_bound_passes_an_area_whose_origin_is_uncertain_in_the_direction_of_the_query_alone(direction):
+    """At 10 m, with a deviation of 6 m in that direction and 1 cm across it."""
+    axes = np.array([[math.cos(direction), -math.sin(direction)], [math.sin(direction), math.cos(direction)]])
+    spread = np.zeros((3, 3))
+    spread[:2, :2] = axes @ np.diag([6.0, 0.01]) ** 2 @ axes.T
+    spread[2, 2] = 1e-6
+    found = ShortestPaths(np.array([3]), np.array([[*(10.0 * axes[:, 0]), 0.0]]), spread[None])
+    query = PoseGaussian(np.zeros(3), 1e-6 * np.eye(3))
+    assert quick_entry_bounds(found, query, 0.0, np.array([2.0]), 1.0, 4.0)[0] > 0.0
+    assert quick_entry_bounds(found, query, 0.0, np.array([2.0]), 1.0, 1.0)[0] == 0.0

@@ -11,8 +11,9 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.messages.map_changes import Arc, AreaPose
+from hmt_slam_ros.messages.map_changes import Arc, AreaPose, StaleBeams
 from hmt_slam_ros.messages.messages import AreaEvents, Hypotheses, Hypothesis
+from hmt_slam_ros.topological_inference.branching import Branching
 
 
 def test_without_an_event_the_hypothesis_stays():
@@ -233,6 +234,19 @@ def test_a_scan_is_evidence_for_or_against_known_ground():
 
 def test_recent_keyframes_are_no_known_ground():
     assert odds_after_return(12, [50.0, 0.0, 0.0]) == pytest.approx(1.0)
+
+
+def test_what_was_computed_from_scans_is_dropped_where_beams_are_stale_and_kept_otherwise(monkeypatch):
+    dropped = []
+    monkeypatch.setattr(Branching, "forget_scans", lambda _: dropped.append(len(run.answers)))
+    run, poses = Run(RING), ring_drive(4)
+    run.keyframe(poses[0])
+    run.keyframe(poses[1])
+    run.stale_beams = (StaleBeams(0, np.array([3, 4]), np.zeros(0, dtype=np.int64), np.zeros(0)),)
+    run.keyframe(poses[2])
+    run.stale_beams = ()
+    run.keyframe(poses[3])
+    assert dropped == [2]
 
 
 def test_acceptance_leaves_one_hypothesis():

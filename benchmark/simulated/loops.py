@@ -22,7 +22,7 @@ from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.sensors.motion_model import increment_covariance
+from hmt_slam_ros.sensors.relative_motion import increment_covariance
 from hmt_slam_ros.simulation import SimulatedLog
 from hmt_slam_ros.simulation.simulated_log import same_place
 

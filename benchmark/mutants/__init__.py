@@ -1,0 +1,1 @@
+"""Mutation testing: do the unit tests notice small faults in the numerical core?"""

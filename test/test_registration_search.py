@@ -1,0 +1,168 @@
+"""Bounds of the search over relative poses, its lattice, and constraints of positions."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from test_registration_branch_and_bound import brute_force
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.registration.branch_and_bound import (
+    constrain_around,
+    gather_block_points,
+    make_reverse_check,
+    search_cells,
+    sum_contradictions,
+)
+from hmt_slam_ros.registration.search_bounds import (
+    BLOCK,
+    LogRatioGrid,
+    add_block,
+    build_pyramid,
+    make_search_window,
+    prior_bound,
+    quarter_bounds,
+    sample_cells,
+    square_bound,
+)
+
+
+def test_a_constraint_admits_the_cells_within_the_radius_of_a_position_anywhere_in_them():
+    known = np.random.default_rng(3).uniform([-4.0, 1.0], [2.0, 4.0], (5, 2))
+    allowed = constrain_around(known, np.zeros((1, 2)), 0.7, 0.2).allowed
+    rows, columns = allowed.log_ratio.shape
+    # And none beyond the grid.
+    x, y = (allowed.origin[k] + 0.2 * (np.arange(-1, size + 1) + 0.5) for k, size in enumerate((columns, rows)))
+    away = np.hypot(x[None, :, None] - known[:, 0], y[:, None, None] - known[:, 1]).min(axis=2)
+    np.testing.assert_array_equal(np.pad(allowed.log_ratio, 1) > 0.0, away <= 0.9)
+
+
+@pytest.mark.parametrize("mean", [(0.7, -0.4, 0.6), (-2.0, 1.0, -2.5)])
+def test_the_lattice_is_the_gate_within_bounds(mean):
+    covariance = np.array([[0.09, 0.02, 0.0], [0.02, 0.04, 0.0], [0.0, 0.0, 0.01]])
+    bounds = np.array(mean)[:2] + np.array([[-0.33, -9.0], [9.0, 0.17]])
+    free, inside = (make_search_window(np.array(mean), covariance, 0.1, 0.05, 9.0, b) for b in (None, bounds))
+    turn = np.array([[np.cos(mean[2]), -np.sin(mean[2])], [np.sin(mean[2]), np.cos(mean[2])]])
+    half = 3.0 * np.sqrt(np.diag(turn @ covariance[:2, :2] @ turn.T)) / 0.1
+    np.testing.assert_array_equal(free.last, np.ceil(half))
+    np.testing.assert_array_equal(free.first, -np.ceil(half))
+    assert inside.first.tolist() == [-4, free.first[1]]
+    assert inside.last.tolist() == [free.last[0], 2]
+
+
+@pytest.mark.parametrize("height", [1, 3])
+def test_a_pyramid_has_the_largest_log_ratios_of_squares_in_steps(height):
+    log_ratio = np.random.default_rng(4).normal(size=(13, 18)).astype(np.float32)
+    pyramid = build_pyramid(log_ratio, height)
+    assert pyramid.step == pytest.approx(log_ratio.max() / 64.0)
+    wide = np.pad(log_ratio, pyramid.margin)
+    for level, side in enumerate(2 ** np.arange(height + 1)):
+        for y, x in itertools.product(range(pyramid.margin + 13), range(pyramid.margin + 18)):
+            steps = wide[y : y + side, x : x + side].max() / pyramid.step
+            assert pyramid.levels[level, y, x] == max(-128, math.ceil(steps - 1e-4))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_bound_of_the_prior_is_no_less_than_its_exponent_and_equal_for_a_single_cell(seed):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(3, 3)) * [[0.3], [0.3], [0.2]]
+    covariance = root @ root.T + 1e-4 * np.eye(3)
+    window = make_search_window(rng.uniform(-1.0, 1.0, 3), covariance, 0.1, 0.05, 9.0)
+
+    def exponent(k, i, j):
+        pose = window.mean + np.array([i * 0.1, j * 0.1, window.turns[k]])
+        return -0.5 * float(np.sum((window.information_root @ se2.log(se2.between(window.mean, pose))) ** 2))
+
+    information = window.information_root.T @ window.information_root
+    np.testing.assert_allclose(information @ covariance, np.eye(3), atol=1e-6)
+    for k, i, j in rng.integers([0, *window.first], [window.turns.size, *window.last + 1], (200, 3)):
+        own = exponent(k, i, j)
+        assert prior_bound(window, k, i, j, 1) == pytest.approx(own if own >= -4.5 else -np.inf)
+        inside = [exponent(k, i + x, j + y) for x, y in itertools.product(range(4), repeat=2)]
+        bound = prior_bound(window, k, i, j, 4)
+        assert bound >= max(each if each >= -4.5 else -np.inf for each in inside) - 1e-9
+    # The lattice holds the whole gate and hardly more.
+    draws = np.random.default_rng(9).normal(size=(4000, 3))
+    draws *= 3.0 / np.linalg.norm(draws, axis=1)[:, None]
+    twists = np.linalg.solve(window.information_root, draws.T).T
+    turned = np.abs(twists[:, 2]).max()
+    assert turned <= window.turns[-1] < turned + 0.1
+    assert window.turns[0] == -window.turns[-1]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_block_has_all_points_that_contradict_in_one_of_its_cells_and_not_many_others(seed):
+    rng = np.random.default_rng(seed)
+    cell = rng.uniform(0.05, 0.2)
+    log_ratio = np.where(rng.random((25, 30)) < 0.1, -1.0, 0.0).astype(np.float32)
+    grid = LogRatioGrid(log_ratio, rng.uniform(-1.5, -0.5, 2), cell)
+    window = make_search_window(rng.uniform(-2.0, 2.0, 3), np.diag([0.2, 0.2, 0.1]) ** 2, 0.1, 0.08, 9.0)
+    check = make_reverse_check(window, grid, rng.uniform(-3.0, 3.0, (400, 2)))
+    chosen = np.empty_like(check.points)
+    for k, i, j in itertools.product(range(0, window.turns.size, 3), (-5, 3), (-4, 1)):
+        count = gather_block_points(check, window, (k, i, j), chosen)
+        contradicts = np.zeros(len(check.points), bool)
+        for x, y in itertools.product(range(i, i + BLOCK), range(j, j + BLOCK)):
+            pose = window.mean + np.array([x * 0.1, y * 0.1, window.turns[k]])
+            at = np.floor((se2.transform(se2.inverse(pose), check.points) - grid.origin) / cell).astype(int)
+            inside = np.all((at >= 0) & (at < (30, 25)), axis=1)
+            contradicts[inside] |= log_ratio[at[inside, 1], at[inside, 0]] < 0.0
+            whole, part = (sum_contradictions(grid, window, (k, x, y), p, -1e9) for p in (check.points, chosen[:count]))
+            assert part == whole == -np.sum(log_ratio[at[inside, 1], at[inside, 0]] < 0.0)
+        gathered = {tuple(point) for point in chosen[:count]}
+        assert gathered >= {tuple(point) for point in check.points[contradicts]}
+        # With the block's middle, a negative cell is within the reach.
+        middle = window.mean + np.array([(i + 1.5) * 0.1, (j + 1.5) * 0.1, window.turns[k]])
+        at = np.floor((se2.transform(se2.inverse(middle), check.points) - grid.origin) / cell)
+        rows, columns = np.nonzero(log_ratio < 0.0)
+        away = np.maximum(np.abs(at[:, :1] - columns), np.abs(at[:, 1:] - rows)).min(axis=1)
+        assert gathered >= {tuple(point) for point in check.points[away <= check.reach]}
+        assert gathered <= {tuple(point) for point in check.points[away <= check.reach + 1.0]}
+    farthest = math.sqrt(0.5) * (BLOCK - 1) * 0.1 / cell
+    assert farthest + 1.0 <= check.reach < farthest + 2.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_sums_over_samples_are_those_of_the_cells_where_they_lie(seed):
+    rng = np.random.default_rng(seed)
+    surface = LogRatioGrid(rng.normal(size=(20, 28)).astype(np.float32), rng.uniform(-1.5, -0.5, 2), 0.1)
+    samples = rng.uniform(-1.0, 1.0, (6, 2))
+    window = make_search_window(rng.uniform(-0.5, 0.5, 3), np.diag([0.2, 0.2, 0.1]) ** 2, 0.1, 0.08, 9.0)
+    cells, pyramid = sample_cells(window, surface, samples), build_pyramid(surface.log_ratio, 3)
+    wide = np.pad(surface.log_ratio, 40)
+    for k, i, j in itertools.product(range(window.turns.size), (-6, -1, 4), (-5, 0, 3)):
+        pose = window.mean + np.array([i * 0.1, j * 0.1, window.turns[k]])
+        at = np.floor((se2.transform(pose, samples) - surface.origin) / 0.1).astype(int)
+        np.testing.assert_array_equal(cells[k] + [i, j], at)
+        totals = np.zeros((BLOCK, BLOCK))
+        add_block(surface.log_ratio, cells[k], i, j, totals)
+        expected = sum(wide[40 + y : 40 + y + BLOCK, 40 + x : 40 + x + BLOCK].astype(float) for x, y in at)
+        np.testing.assert_allclose(totals, expected, atol=1e-5)
+        # One by one: interpreted, sums of int8 overflow.
+        for n, (level, side) in itertools.product(range(len(at)), ((1, 2), (2, 4))):
+            bounds, own = (pyramid.levels[level], pyramid.margin, cells[k, n : n + 1]), at[n] + pyramid.margin
+            four = [square_bound(*bounds, i + x, j + y) for y in (0, side) for x in (0, side)]
+            assert np.ravel(quarter_bounds(*bounds, i, j, side)).tolist() == four
+            assert four[0] == (bounds[0][own[1], own[0]] if (own >= 0).all() and (own < (44, 36)).all() else 0)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_search_for_one_sample_finds_the_cells_that_brute_force_finds(seed):
+    """A single one, since interpreted sums of int8 overflow; all of the search is the same for many."""
+    rng = np.random.default_rng(seed)
+    surface, back = (
+        LogRatioGrid(rng.normal(size=(30, 34)).astype(np.float32), rng.uniform(-2.0, -1.5, 2), cell)
+        for cell in (0.1, 0.13)
+    )
+    samples, back_samples = rng.uniform(-0.5, 0.5, (1, 2)), rng.uniform(-1.5, 1.5, (12, 2))
+    spread = np.diag([0.35, 0.3, 0.05]) ** 2 + 0.002
+    window = make_search_window(rng.uniform(-0.3, 0.3, 3), spread, 0.1, 0.08, 9.0)
+    expected = brute_force(window, surface, samples, back, back_samples, 0.5)
+    best = max(expected.values())
+    expected = {cell: score for cell, score in expected.items() if score >= best - 2.0}
+    found = search_cells(window, surface, samples, back, back_samples, 0.5, -100.0, 2.0)
+    scores = {tuple(cell): score for cell, score in zip(found.indices.tolist(), found.score, strict=True)}
+    assert len(expected) > 20
+    assert scores.keys() == expected.keys()
+    assert scores == pytest.approx(expected, abs=1e-5)
