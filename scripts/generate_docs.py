@@ -1,17 +1,18 @@
 #!/usr/bin/env python3
-"""Write the files that follow from the code: config/hmt_slam.yaml, and in docs/ the pages of ``GENERATED``."""
+"""Write the files that follow from the code: those of ``GENERATED`` in config/ and docs/."""
 
 from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from string import Template
 
 from hmt_slam_ros.configuration import Configuration, flat_parameters
 from hmt_slam_ros.configuration.documents import parameter_reference, parameter_table, ros_yaml
+from hmt_slam_ros.process_table import COMPANIONS, COORDINATOR, DOCUMENTS, PROCESSES, RECORDER, NodeRow, ProcessRow
 from hmt_slam_ros.results.hmt_map import PARTS, ChainState, MapDocument
 from hmt_slam_ros.results.log_reading import FIXED_PARAMETERS
 from hmt_slam_ros.saved_map.folder import FORMAT, SCANS, VERSION
@@ -120,8 +121,151 @@ def _strip_parentheses(node: ast.expr) -> str:
     return ", ".join(map(ast.unparse, node.elts)) if isinstance(node, ast.Tuple) else ast.unparse(node)
 
 
+_MESSAGE_TOPICS = {
+    **{row.message.partition(":")[2]: (row.topic,) for row in DOCUMENTS},
+    "Scan": ("scan",),
+    "Odometry": ("odom",),
+    "PoseReset": ("initialpose",),
+    "EndOfLog": ("hmt/robot_status",),
+    "Keyframe": ("hmt/keyframes", "hmt/keyframe_scans"),
+    "ScanPoses": ("hmt/scan_poses",),
+    "EndOfRun": ("hmt/finished",),
+    "RealTimePose": ("hmt/pose", "pose"),
+    "VelocityCommand": ("cmd_vel",),
+    "Task": ("~/task",),
+    "TaskResult": (),
+}
+"""{message class: its topics}; the robot of a simulation gets a TaskResult only within one program."""
+
+_REQUESTS, _RESPONSES = ("hmt/save_request", "hmt/reset_request"), ("hmt/save_response", "hmt/reset_response")
+
+_TASK_TOPICS = ("cmd_vel", "~/task_result", "goal_pose")
+"""Published by the nodes that carry out tasks."""
+
+_FURTHER_PUBLISHED: dict[str, tuple[str, ...]] = {
+    "slam": (*_REQUESTS, "hmt/particles"),
+    "tsbi": ("hmt/pmf", "hmt/is_localized", "hmt/entropy"),
+    "tlca": ("map", "hmt/graph"),
+    "rtl": ("tf",),
+    "robot": ("scan", "odom", "/clock", "hmt/robot_status", "tf", "tf_static", "ground_truth"),
+    "explorer": _TASK_TOPICS,
+    "pilot": (*_TASK_TOPICS, "pilot/place_estimate", "initialpose"),
+    "operator": ("initialpose", "explorer/task", "pilot/task"),
+}
+"""{node: topics that follow from no message of the process table}."""
+
+_FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
+    "slam": (*_RESPONSES, "tf_static"),
+    "view": (
+        *("pose", "hmt/pose", "hmt/graph", "map", "hmt/keyframes", "hmt/hypotheses", "hmt/is_localized"),
+        *("hmt/entropy", "hmt/robot_status", "diagnostics"),
+    ),
+    "robot": ("hmt/local_estimate", "hmt/tracking_reset"),
+    "explorer": ("hmt/reset_request", "tf_static"),
+    "pilot": ("hmt/reset_request", "tf_static"),
+    "recorder": ("hmt/area_events", "hmt/robot_status", "diagnostics", "hmt/cost"),
+    "operator": (
+        *("map", "pose", "hmt/pose", "hmt/graph", "hmt/particles", "diagnostics", "hmt/notices", "scan", "tf"),
+        *("tf_static", "explorer/task_result", "pilot/task_result", "pilot/place_estimate"),
+    ),
+}
+"""{node: topics that follow from no message of the process table}."""
+
+_SERVICES = {
+    "slam": ("save", "load_map", "reset", "relocalize", "pause"),
+    "tlca": ("get_map",),
+    "robot": ("pause",),
+}
+"""{node: its services beside those of every node}."""
+
+_PARAMETER_SERVICES = (
+    *("describe_parameters", "get_parameter_types", "get_parameters", "list_parameters", "set_parameters"),
+    *("set_parameters_atomically", "get_type_description"),
+)
+_LIFECYCLE_SERVICES = (
+    *("change_state", "get_state", "get_available_states", "get_available_transitions", "get_transition_graph"),
+)
+
+
+def _is_managed(row: NodeRow) -> bool:
+    return isinstance(row, ProcessRow) or "Task" in row.consumes
+
+
+def _services(row: NodeRow) -> tuple[str, ...]:
+    """Services of a node, without its name."""
+    return (
+        *_SERVICES.get(row.name, ()),
+        *_PARAMETER_SERVICES,
+        *(_LIFECYCLE_SERVICES if _is_managed(row) else ()),
+    )
+
+
+def _publications(row: NodeRow) -> Iterator[str]:
+    """Topics that a node publishes."""
+    yield from ("/rosout", "/parameter_events", "diagnostics", "hmt/cost")
+    if _is_managed(row):
+        yield "~/transition_event"
+    if isinstance(row, ProcessRow):
+        for message in (*row.produces, "Notice"):
+            yield from _MESSAGE_TOPICS[message]
+        if row.name != COORDINATOR:
+            yield from _RESPONSES
+    yield from _FURTHER_PUBLISHED.get(row.name, ())
+
+
+def _subscriptions(row: NodeRow) -> Iterator[str]:
+    """Topics that a node subscribes to."""
+    yield from ("/clock", "/parameter_events")
+    for message in row.consumes:
+        yield from _MESSAGE_TOPICS[message]
+    if isinstance(row, ProcessRow) and row.name != COORDINATOR:
+        yield from _REQUESTS
+    yield from _FURTHER_SUBSCRIBED.get(row.name, ())
+
+
+def sros2_policy(_configuration: Configuration) -> str:
+    """config/sros2_policy.xml: what each node may publish, subscribe to, answer and request, as sros2 reads it."""
+    rows = (*PROCESSES, *COMPANIONS, RECORDER)
+    operator = NodeRow("operator", "a person at the command line or RViz")
+    enclaves = [_enclave(row, (), _services(row)) for row in rows]
+    requests = [f"{row.name}/{service}" for row in rows for service in _services(row)]
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        "<!-- Generated by scripts/generate_docs.py from hmt_slam_ros/process_table.py; do not edit the copy in git.",
+        "     In the schema of sros2, policy.xsd of version 0.2.0. See docs/guides/security.md. -->",
+        '<policy version="0.2.0">',
+        "  <enclaves>",
+        *(line for enclave in (*enclaves, _enclave(operator, requests, _services(operator))) for line in enclave),
+        "  </enclaves>",
+        "</policy>",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _enclave(row: NodeRow, requests: Iterable[str], services: Iterable[str]) -> list[str]:
+    """Lines of the enclave of a node."""
+    return [
+        f'    <enclave path="/hmt_slam/{row.name}">',
+        "      <profiles>",
+        f'        <profile ns="/" node="{row.name}">',
+        *_rules("topic", "publish", _publications(row)),
+        *_rules("topic", "subscribe", _subscriptions(row)),
+        *_rules("service", "reply", (f"~/{name}" for name in services)),
+        *_rules("service", "request", requests),
+        "        </profile>",
+        "      </profiles>",
+        "    </enclave>",
+    ]
+
+
+def _rules(kind: str, qualifier: str, names: Iterable[str]) -> list[str]:
+    listed = [f"            <{kind}>{name}</{kind}>" for name in sorted(set(names))]
+    return [f'          <{kind}s {qualifier}="ALLOW">', *listed, f"          </{kind}s>"] if listed else []
+
+
 GENERATED = {
     "config/hmt_slam.yaml": ros_yaml,
+    "config/sros2_policy.xml": sros2_policy,
     "docs/reference/constants.md": constants,
     "docs/reference/map_format.md": map_format,
     "docs/reference/parameters.md": parameter_reference,
