@@ -26,6 +26,7 @@ from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, Edge
 from hmt_slam_ros.results.hmt_map import read_saved_map
 from hmt_slam_ros.results.log_reading import map_folder
 from hmt_slam_ros.submap.local_mapping import LocalMapping
+from hmt_slam_ros.untrusted_input import shorten
 
 _FINEST, _COARSEST = 0.005, 10.0
 """Limits of the resolution of a grid, m."""
@@ -156,6 +157,8 @@ def export_topology(directory: Path) -> tuple[Path, Path, Path]:
     import networkx as nx  # noqa: PLC0415  it takes 0.2 s and 12 MB, for this command alone
 
     graph = nx.DiGraph()
+    if missing := sorted(set(hybrid_map.area_ids()) - saved.area_poses.keys()):
+        raise HmtSlamError(f"{directory} has no pose of the areas {shorten(missing)}: map the log again")
     for area in hybrid_map.area_ids():
         has_robot = area == saved.replica.robot_areas[best]
         keyframes = hybrid_map.keyframes(area)

@@ -110,7 +110,7 @@ def _darkest_rows(pixels: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
 
 
 def _draw_keyframes(axes: Axes, hybrid_map: HybridMap, area_poses: Mapping[int, PoseGaussian]) -> None:
-    for area in hybrid_map.area_ids():
+    for area in sorted(area_poses.keys() & set(hybrid_map.area_ids())):
         poses = np.array(list(hybrid_map.keyframes(area).values())).reshape(-1, 3)
         points = se2.transform(area_poses[area].mean, poses[:, :2])
         axes.plot(points[:, 0], points[:, 1], ".", color=_color_of(area), markersize=4, zorder=3)
@@ -121,7 +121,7 @@ def _draw_arcs(axes: Axes, hybrid_map: HybridMap, area_poses: Mapping[int, PoseG
         ends = [
             (area_poses[a].mean[:2], area_poses[b].mean[:2])
             for a, b, arc in hybrid_map.all_arcs()
-            if arc.closure == closure
+            if arc.closure == closure and {a, b} <= area_poses.keys()
         ]
         if ends:
             axes.add_collection(LineCollection(ends, colors=color, linewidths=1.2, label=label, zorder=4))
