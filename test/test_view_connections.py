@@ -1,4 +1,4 @@
-"""The live page against clients that connect and say nothing, do not read, or ask under another site's name."""
+"""The live page against clients that connect and send nothing, do not read, or ask under another site's name."""
 
 import contextlib
 import http.client
