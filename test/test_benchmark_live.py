@@ -18,6 +18,7 @@ def test_messages_before_the_first_answer_are_not_missing():
 
 
 def test_a_laser_with_forty_scans_a_second_is_kept_up_with():
-    times = measure_fast(FAST, seconds=4.0)
-    assert len(times.sent) == len(times.delays) == 161
-    assert np.median(times.delays[-20:]) < 1.0
+    times = measure_fast(FAST, seconds=6.0)
+    assert len(times.sent) == len(times.delays) == 241
+    # What waited while kernels were compiled or loaded is worked off; a laser too fast would let the delays grow.
+    assert times.delays[-20:].min() < max(0.3, times.delays.max() - 0.5), times.delays
