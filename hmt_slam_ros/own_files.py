@@ -82,19 +82,28 @@ def replace_folder(new: Path, target: Path) -> None:
     """Exchange a folder with ``target``, or move it there where ``target`` does not exist.
 
     :param new: complete folder on the same file system.
-    :raises OSError: where the folder cannot be moved.
+    :raises OSError: where the folder cannot be moved; ``target`` is as it was then.
     """
     _flush(new)
     if not target.exists():
         new.rename(target)
     elif not _exchange(new, target):
-        # The file system cannot exchange two names: for a moment, there is no target.
-        aside = new.with_name(_ASIDE)
-        target.rename(aside)
-        new.rename(target)
-        aside.rename(new)
+        _replace_in_two_steps(new, target)
     with suppress(OSError):  # it stands there
         _flush_folder(target.parent)
+
+
+def _replace_in_two_steps(new: Path, target: Path) -> None:
+    """Replace a folder where two names cannot be exchanged: for a moment, there is no target."""
+    aside = new.with_name(_ASIDE)
+    target.rename(aside)
+    try:
+        new.rename(target)
+    except OSError:
+        aside.rename(target)
+        raise
+    with suppress(OSError):  # it stands there
+        aside.rename(new)
 
 
 def _exchange(one: Path, other: Path) -> bool:

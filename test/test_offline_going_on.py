@@ -2,13 +2,12 @@
 
 import dataclasses
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from misled import make_misled
+from preloaded import hmt_slam
 
 from hmt_slam_ros.cli import run_commands
 from hmt_slam_ros.cli.arguments import build_parser
@@ -179,17 +178,12 @@ def test_a_run_whose_areas_end_at_doors_goes_on_with_the_openings_that_it_saw(tm
     assert len(stopped) > 3
 
 
-def run_map(folder, *options):
-    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(LOG), "--out", str(folder), *options]
-    return subprocess.run(command, check=False, timeout=300, capture_output=True, text=True)
-
-
 @pytest.fixture(scope="module")
 def first(tmp_path_factory):
     """The map of the first seconds, with parameters of its own."""
     folder = tmp_path_factory.mktemp("maps") / "first"
-    done = run_map(folder, "--duration", "6", "--seed", "3", "--set", "aam.confirmations=3")
-    assert done.returncode == 0, done.stderr
+    options = ("--duration", 6, "--seed", 3, "--set", "aam.confirmations=3")
+    hmt_slam("map", LOG, "--out", folder, *options, check=True)
     return folder
 
 
@@ -197,10 +191,9 @@ def test_the_command_goes_on_with_the_parameters_of_the_map_which_it_may_replace
     shutil.copytree(first, tmp_path / "on")
     for folder, options in {
         "whole": ("--seed", "3", "--set", "aam.confirmations=3"),
-        "on": ("--from", str(tmp_path / "on")),
+        "on": ("--from", tmp_path / "on"),
     }.items():
-        done = run_map(tmp_path / folder, "--duration", "12", *options)
-        assert done.returncode == 0, done.stderr
+        hmt_slam("map", LOG, "--out", tmp_path / folder, "--duration", 12, *options, check=True)
     assert contents(tmp_path / "whole" / "hmt_map") == contents(tmp_path / "on" / "hmt_map")
     for name in ("trajectory.tum", "trajectory_online.tum", "pmf.csv", "map.pgm", "graph.g2o"):
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "on" / name).read_bytes()

@@ -1,12 +1,11 @@
 """A map that a further log extends: poses of all logs in one frame, whatever the clocks of the logs say."""
 
 import dataclasses
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from preloaded import hmt_slam
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.evaluation import read_tum
@@ -134,20 +133,17 @@ def test_the_clock_of_a_map_goes_on_in_a_log_that_is_older(first, second_log):
     assert record.source_stamp < first.log.source_stamps[0]
 
 
-def hmt_slam(*words):
-    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", *map(str, words)]
-    done = subprocess.run(command, check=False, timeout=300, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done
-
-
 def test_the_command_says_whether_the_log_is_a_further_one_and_writes_the_poses_of_all(tmp_path):
-    hmt_slam("map", BUNDLED, "--out", tmp_path / "a", "--duration", 6, "--start", 0.5)
-    reported = hmt_slam("map", BUNDLED, "--out", tmp_path / "b", "--duration", 9, "--from", tmp_path / "a").stderr
+    def map_part(log, name, seconds, *options):
+        """What the command reports."""
+        return hmt_slam("map", log, "--out", tmp_path / name, "--duration", seconds, *options, check=True).stderr
+
+    map_part(BUNDLED, "a", 6, "--start", 0.5)
+    reported = map_part(BUNDLED, "b", 9, "--from", tmp_path / "a")
     assert "malaga_one_loop is the log that the map was made of, of which " in reported
     assert "it is a further one" not in reported
     assert not (tmp_path / "b" / "earlier").exists()
-    reported = hmt_slam("map", WORLD, "--out", tmp_path / "c", "--duration", 5, "--from", tmp_path / "b").stderr
+    reported = map_part(WORLD, "c", 5, "--from", tmp_path / "b")
     assert "it is a further one" in reported
     scans = [len(scans_of(log)) for log in (open_log(BUNDLED, start=0.5, duration=9.0), open_log(WORLD, duration=5.0))]
     for name in ("trajectory", "trajectory_online", "stages/keyframes"):

@@ -5,9 +5,11 @@ import os
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 
+from hmt_slam_ros import own_files
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.own_files import ScratchFolder, write_file
 
@@ -72,3 +74,22 @@ def test_the_scratch_folder_of_a_killed_process_goes_and_every_other_stays(tmp_p
     assert names(tmp_path) == sorted([alive.path.name, ".out.partial-backup", ".out.partial-made"])
     alive.remove()
     assert names(tmp_path) == [".out.partial-backup", ".out.partial-made"]
+
+
+def test_a_folder_that_cannot_be_moved_in_two_steps_leaves_the_old_one(tmp_path, monkeypatch):
+    """A file system that cannot exchange two names, and a disk that fails at the second step."""
+    for name in ("book", "new"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "page").write_text(name)
+    rename = Path.rename
+
+    def fail_for_new(path, target):
+        if path.name == "new":
+            raise OSError(errno.EIO, "Input/output error")
+        return rename(path, target)
+
+    monkeypatch.setattr(own_files, "_exchange", lambda one, other: False)
+    monkeypatch.setattr(Path, "rename", fail_for_new)
+    with pytest.raises(OSError, match="Input/output error"):
+        own_files.replace_folder(tmp_path / "new", tmp_path / "book")
+    assert (tmp_path / "book" / "page").read_text() == "book"

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -318,19 +319,22 @@ def test_the_saved_map_keeps_every_live_hypothesis(tmp_path: Path) -> None:
 
 
 def test_the_saved_map_keeps_that_a_hypothesis_lacks_an_arc(tmp_path: Path) -> None:
+    """It has another way between the two areas, along a third one."""
     recorder = make_recorder()
+    moved, arc = MovedKeyframe(VERDICT, 1, 2, np.zeros(3)), PoseGaussian(np.ones(3), 0.01 * np.eye(3))
     for k in range(VERDICT, SCANS // EVERY):
-        withdrawn = (ArcEnds(0, 1),) if k == VERDICT else ()
-        recorder.hypotheses[k] = Hypotheses(
-            k, (Hypothesis(1, 1, 0.6, 1, removed_arcs=withdrawn), Hypothesis(2, 2, 0.4, 0))
-        )
+        changes: dict[str, Any] = {}
+        if k == VERDICT:
+            arcs = Arc(0, 2, arc), Arc(1, 2, arc)
+            changes = {"moved_keyframes": (moved,), "arcs": arcs, "removed_arcs": (ArcEnds(0, 1),)}
+        recorder.hypotheses[k] = Hypotheses(k, (Hypothesis(1, 1, 0.6, 1, None, **changes), Hypothesis(2, 2, 0.4, 0)))
         recorder.decisions[k] = ClosureDecision(k)
     recording = recorder.finish(STAMPS)
     writer = MapWriter(tmp_path / "hmt_map")
     writer.write_map(recording.replica, recording.area_poses, recording.last_estimate)
     writer.finish(recorder.configuration)
     saved = read_saved_map(tmp_path / "hmt_map")
-    assert list(saved.replica.maps[1].changed_arcs) == [(0, 1)]
+    assert sorted(saved.replica.maps[1].changed_arcs) == [(0, 1), (0, 2), (1, 2)]
     assert saved.replica.maps[1].arc(0, 1) is None
 
 

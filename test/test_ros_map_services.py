@@ -1,8 +1,11 @@
 """What the services of slam do with folders: nothing of others is replaced, and what is no map is refused at once."""
 
 import asyncio
+import errno
 import json
 import os
+import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -13,7 +16,7 @@ from nav_msgs.srv import LoadMap
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.ros.map_services import MapLoader, check_map_is_replaceable
+from hmt_slam_ros.ros.map_services import MapLoader, MapSaver, _PendingSave, check_map_is_replaceable
 from hmt_slam_ros.saved_map.folder import FORMAT, MANIFEST, VERSION, FolderWriter
 
 
@@ -102,3 +105,34 @@ def test_a_folder_whose_manifest_is_none_is_refused_at_once(tmp_path, make):
     assert result == LoadMap.Response.RESULT_INVALID_MAP_DATA
     assert f"{tmp_path} is not loaded: " in warning
     assert len(warning) < 500
+
+
+def test_a_save_that_cannot_begin_leaves_no_temporary_folder(tmp_path, monkeypatch):
+    def mkdir(path, *arguments, **options):
+        if path.name == "new":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return make(path, *arguments, **options)
+
+    make = Path.mkdir
+    monkeypatch.setattr(Path, "mkdir", mkdir)
+    with pytest.raises(OSError, match="No space left"):
+        _PendingSave.begin(tmp_path / "hmt_map")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_loaded_map_that_cannot_be_copied_is_reported_with_the_reason(tmp_path, monkeypatch):
+    """In localization a save copies the loaded map; here a file of it became unreadable."""
+    loaded = tmp_path / "loaded"
+    loaded.mkdir()
+    (loaded / "map.json").write_text("{}")
+    monkeypatch.setattr(shutil, "copyfile", fail_to_copy)
+    node = SimpleNamespace(unchanged_map_folder=loaded, configuration=Configuration())
+    saver = MapSaver.__new__(MapSaver)
+    saver._node, saver._responses, saver._target = node, {}, tmp_path / "hmt_map"
+    saver._pending_save = _PendingSave.begin(saver._target)
+    with pytest.raises(HmtSlamError, match=r"hmt_map cannot be saved: Input/output error; the map of before stays"):
+        saver._finish()
+
+
+def fail_to_copy(source, target):
+    raise OSError(errno.EIO, "Input/output error", str(source))

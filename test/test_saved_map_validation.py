@@ -1,5 +1,6 @@
 """Maps that were tampered with behind right checksums: no process is handed one."""
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -12,12 +13,17 @@ import pytest
 
 from hmt_slam_ros.cli.main import main
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.hybrid_map.hybrid_map import GraphState, HybridMap
+from hmt_slam_ros.messages.messages import Hypotheses, Hypothesis, PrunedKeyframe
+from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.plain_data import field_names, is_record
 from hmt_slam_ros.results.hmt_map import PARTS, ChainState, MapDocument, read_run_state, read_saved_map
 from hmt_slam_ros.saved_map.field_limits import _LIMITS, _SHAPES
-from hmt_slam_ros.saved_map.folder import FORMAT, MANIFEST, VERSION, FolderReader, _manifest_digest
+from hmt_slam_ros.saved_map.folder import FORMAT, MANIFEST, SCANS, VERSION, FolderReader, _manifest_digest
+from hmt_slam_ros.saved_map.hypothesis_maps import check_hypothesis_maps
+from hmt_slam_ros.saved_map.reference import document_reference
 from hmt_slam_ros.saved_map.scans import ScanTable
-from hmt_slam_ros.saved_map.validation import _CHECKS
+from hmt_slam_ros.saved_map.validation import _CHECKS, check_process_states, check_record
 from hmt_slam_ros.sensors import Scan
 
 BUNDLED = Path(__file__).parents[1] / "data" / "malaga_one_loop"
@@ -37,6 +43,17 @@ def records_of(kind, found):
 RECORDS = {}
 for part in (*PARTS.values(), MapDocument, ChainState, ScanTable):
     records_of(part, RECORDS)
+
+
+FORM = (19, "76a9f2bc5841c4d5")
+"""Version of the format, and the digest of all fields and types: a change of one is a change of both."""
+
+
+def test_a_changed_field_has_a_new_version():
+    lines = document_reference({"map": MapDocument, SCANS: ScanTable, "chain": ChainState, **PARTS})
+    form = [line.rsplit(" | ", 1)[0] for line in lines if line.startswith(("### ", "| `"))]
+    assert len(form) > 300
+    assert (VERSION, hashlib.sha256("\n".join(form).encode()).hexdigest()[:16]) == FORM
 
 
 def test_every_array_of_every_record_has_a_shape():
@@ -127,11 +144,23 @@ def fill(value):
         ("aam.json", put("partitions", value=[]), "partitions = .* is not those of replica"),
         ("tsbi.json", put("next_hypothesis", value=0), r"tsbi\.next_hypothesis = 0 is not above 0"),
         ("tsbi.json", put("unexamined", value=-0.5), r"tsbi\.unexamined = -0\.5 is not 0 to 1"),
+        ("tsbi.json", put("unexamined", value=0.5), r"tsbi\.unexamined = 0\.5 is not what the probabilities of the"),
+        ("tsbi.json", put("hypothesis_states", 0, 1, "pending_candidates", value=[7]), r"= \[7\] is not areas of the"),
+        ("tsbi.json", put("hypothesis_states", 0, 1, "unmatched_keyframes", value=[7]), r"= \[7\] is not keyframes of"),
+        (
+            "tsbi.json",
+            put("hypothesis_states", 0, 1, "localization", "relocalized_area", value=7),
+            r"relocalized_area = \[7\] is not areas of the hypothesis",
+        ),
+        ("aam.json", put("partitions", 0, 1, "area", value=7), r"partitions\.area = 7 is not 0, the robot's area"),
+        ("slam.json", put("live_hypotheses", 0, 1, "event", "anchor", value=9), r"anchor = 9 is not a keyframe of the"),
         ("tlca.json", put("paths", value=[]), r"tlca\.paths = \[\] is not those of replica"),
+        ("tlca.json", put("paths", 0, 1, "version", value=99), r"paths\[0\]\.version = 99 is not at most"),
+        ("slam.json", put("keyframe_events", value=2**30), r"recorder\.events = 1 is not 1073741824, as of slam"),
         ("log.json", put("first_scans", value=[]), r"log\.first_scans = \(\) is not from 0 to"),
         ("log.json", put("records_read", value=0), r"log\.records_read = 0 is not as many as"),
         ("recorder.json", put("parents", value=[[1, 2], [2, 1]]), r"recorder\.parents = .* is not older than"),
-        ("recorder.json", put("events", value=2**30), r"recorder\.events = 1073741824 is not .*, as of slam"),
+        ("recorder.json", put("events", value=2**30), r"probabilities = \[0\] is not up to the last event"),
         ("rtl.json", put("ambiguity", "shape", value=[-3, -3]), r"rtl\.ambiguity = .* is not an array of float64"),
         ("rtl.json", put("ambiguity", "shape", value=[9]), r"rtl\.ambiguity = an array of shape \(9,\) is not one of"),
         ("rtl.json", put("ambiguity", "shape", value=[3.0, 3]), r"rtl\.ambiguity = .* is not an array of float64"),
@@ -155,6 +184,82 @@ def test_the_same_bytes_cannot_be_two_arrays(map_folder, tmp_path):
 
     with pytest.raises(HmtSlamError, match="is not an array of float64"):
         read_saved_map(tamper(map_folder, tmp_path / "map", "map.json", change))
+
+
+def replica_of(keyframes, counts, arcs, changed=None):
+    """A replica of areas 0, 1, ... with their keyframes and arcs.
+
+    :param changed: a graph that differs, that of hypothesis 0.
+    """
+    count = len(arcs)
+    common = GraphState(
+        np.arange(len(counts)),
+        np.array(counts),
+        np.array(keyframes),
+        np.zeros((len(keyframes), 3)),
+        np.array(arcs, np.int64).reshape(-1, 2),
+        np.zeros((count, 3)),
+        np.tile(np.eye(3), (count, 1, 1)),
+        np.zeros(count, bool),
+        np.zeros(count, bool),
+    )
+    return ReplicaState(common=common, changes={0: changed or GraphState.empty()})
+
+
+def test_every_keyframe_is_in_one_area_and_arcs_join_all_areas():
+    check_hypothesis_maps(replica_of([3, 4, 5], [2, 1], [(0, 1)]), "map")
+    for replica, sentence in (
+        (replica_of([3, 3, 5], [2, 1], [(0, 1)]), "keyframes = one twice is not one of each"),
+        (replica_of([3, 4, 3], [2, 1], [(0, 1)]), "keyframes = one twice is not one of each"),
+        (replica_of([3, 4, 5], [3, 0], [(0, 1)]), "keyframe_counts = 0 is not 1 or more in each area"),
+        (replica_of([3, 4, 5], [1, 1, 1], [(0, 1)]), r"arcs = none to \[2\] is not a way along arcs to every area"),
+    ):
+        with pytest.raises(HmtSlamError, match=sentence):
+            check_hypothesis_maps(replica, "map")
+
+
+def test_a_hypothesis_is_checked_with_the_areas_and_arcs_that_differ():
+    moved = replica_of([4, 5], [2], []).common
+    check_hypothesis_maps(replica_of([4, 5, 6], [2, 1], [(0, 1)], moved), "map")
+    with pytest.raises(HmtSlamError, match="keyframes = one twice"):
+        check_hypothesis_maps(replica_of([4, 6, 5], [2, 1], [(0, 1)], moved), "map")
+    without_arc = dataclasses.replace(replica_of([], [], [(0, 1)]).common, removed=np.ones(1, bool))
+    with pytest.raises(HmtSlamError, match=r"none to \[1\]"):
+        check_hypothesis_maps(replica_of([4, 6, 5], [2, 1], [(0, 1)], without_arc), "map")
+
+
+def test_a_keyframe_that_was_pruned_from_all_hypotheses_needs_no_scan():
+    """The common map has it until the next commit, and a map that is saved meanwhile is read."""
+    scan = Scan(0, np.ones(3, np.float32), -0.5, 0.5, 0.1, 10.0)
+    replica = Replica({k: dataclasses.replace(scan, stamp=k) for k in range(3)}, {0: HybridMap()}, {0: 1.0}, {0: 0})
+    for keyframe in range(3):
+        replica.maps[0].set_keyframe(keyframe, 0, np.zeros(3))
+    replica.maps[0].commit()
+    replica.apply_hypotheses(
+        Hypotheses(3, (Hypothesis(0, 0, 1.0, 0, None),), 0.0, pruned_keyframes=(PrunedKeyframe(1, 0),))
+    )
+    state = replica.state
+    assert 1 in state.common.keyframes
+    assert sorted(state.scans) == [0, 2]
+    check_record(state, "replica")
+    with pytest.raises(HmtSlamError, match=r"scans = without \[2\] is not a scan for every keyframe"):
+        check_record(dataclasses.replace(state, scans={0: scan}), "replica")
+
+
+def test_the_states_of_all_processes_have_the_same_map(map_folder):
+    state, configuration = read_run_state(map_folder)
+    check_process_states(state.processes, configuration)
+    other = dataclasses.replace(state.processes["aam"], replica=ReplicaState())
+    with pytest.raises(HmtSlamError, match=r"aam\.replica\.scans = .* is not that of slam"):
+        check_process_states({**state.processes, "aam": other}, configuration)
+
+
+def test_an_array_without_elements_is_no_larger_than_its_file(map_folder, tmp_path):
+    """NumPy raises a ValueError at the first shape, and whoever goes through the rows of the second never ends."""
+    for number, shape in enumerate(([0, 2**31, 2**31, 2**31], [2**31, 0])):
+        change = put("replica", "common", "arcs", "shape", value=shape)
+        with pytest.raises(HmtSlamError, match=r"arcs = .* is not an array of int64"):
+            read_saved_map(tamper(map_folder, tmp_path / str(number), "map.json", change))
 
 
 @pytest.mark.parametrize("name", ["../notes", "/etc/passwd", "a/b", "", "..", "n" * 300, "a\nb", MANIFEST])

@@ -73,11 +73,12 @@ class InitialState:
         self.events, self.lost, self.previous_scans = 0, lost and bool(path), previous_scans
         self._configuration = node.configuration
         self._reader: FolderReader | None = None
+        self._saved_events: int | None = None
         self.folder: Path | None = None
         if path:
             self.folder = map_folder(Path(path)).absolute()
             self._open(node, self.folder, FORMAT)
-            self.events = self._chain_events()
+            self.events = self._saved_events = self._chain_events()
 
     @classmethod
     def from_checkpoint(cls, node: ConfigurationSource, state: Path, header: JournalHeader) -> InitialState:
@@ -120,7 +121,7 @@ class InitialState:
             )
         part = self._reader.read(name, kind)
         if name == COORDINATOR:
-            check_slam_state(part, self._configuration)
+            check_slam_state(part, self._configuration, self._saved_events)
         return part
 
     @cached_property

@@ -25,7 +25,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.documents import ResetRequest, ResetResponse, SaveRequest, SaveResponse, encode
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.own_files import ScratchFolder, replace_folder
-from hmt_slam_ros.process_table import participant_names
+from hmt_slam_ros.process_table import COORDINATOR, participant_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.initial_state import InitialState
@@ -34,6 +34,7 @@ from hmt_slam_ros.ros.message_io import subscribe_document
 from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.topics import DOCUMENTS
 from hmt_slam_ros.saved_map.folder import FORMAT, HMT_MAP, foreign_entry
+from hmt_slam_ros.saved_map.validation import check_process_states
 from hmt_slam_ros.untrusted_input import shorten
 
 if TYPE_CHECKING:
@@ -203,6 +204,22 @@ class _PendingSave(NamedTuple):
     scratch: ScratchFolder
     writer: MapWriter
 
+    @classmethod
+    def begin(cls, target: Path) -> _PendingSave:
+        """A save to a folder.
+
+        :raises OSError: where nothing can be written beside it; no temporary folder is left then.
+        """
+        from hmt_slam_ros.results.hmt_map import MapWriter  # noqa: PLC0415  only for a save
+
+        target.parent.mkdir(parents=True, exist_ok=True)
+        scratch = ScratchFolder(target, target.parent)
+        try:
+            return cls(scratch, MapWriter(scratch.path / "new"))
+        except OSError:
+            scratch.remove()
+            raise
+
     @property
     def folder(self) -> Path:
         return self.scratch.path / "new"
@@ -251,15 +268,11 @@ class MapSaver(RequestCoordinator):
         return self._final_save is not None and self._final_save.done()
 
     def _make_request(self, number: int, events: int) -> SaveRequest:
-        from hmt_slam_ros.results.hmt_map import MapWriter  # noqa: PLC0415  only for a save
-
         if self._node.estimate is None:
             raise HmtSlamError("nothing is mapped yet, drive first")
         try:
             check_map_is_replaceable(self._target)
-            self._target.parent.mkdir(parents=True, exist_ok=True)
-            scratch = ScratchFolder(self._target, self._target.parent)
-            self._pending_save = _PendingSave(scratch, MapWriter(scratch.path / "new"))
+            self._pending_save = _PendingSave.begin(self._target)
             self._pending_save.writer.write_slam_state(self._node.process.state)
             self._node.write_map(self._pending_save.writer)
         except OSError as fault:
@@ -282,8 +295,14 @@ class MapSaver(RequestCoordinator):
     def _copy_unchanged_map(self) -> Path | None:
         """A copy of the loaded map where the robot was only localized in it, else None."""
         assert self._pending_save is not None
-        loaded = self._node.unchanged_map_folder
-        return None if loaded is None else Path(shutil.copytree(loaded, self._pending_save.scratch.path / "kept"))
+        loaded, kept = self._node.unchanged_map_folder, self._pending_save.scratch.path / "kept"
+        if loaded is None:
+            return None
+        kept.mkdir()
+        for file in loaded.iterdir():
+            if file.is_file():
+                shutil.copyfile(file, kept / file.name)
+        return kept
 
     def _clean_up(self) -> None:
         if self._pending_save is not None:
@@ -359,8 +378,8 @@ class MapLoader(RequestCoordinator):
         from hmt_slam_ros.results.hmt_map import PARTS  # noqa: PLC0415  only for a load
 
         initial_state = InitialState(self._node, str(folder), lost=True)
-        for name in participant_names():
-            initial_state.read_part(name, PARTS[name])
+        parts = {name: initial_state.read_part(name, PARTS[name]) for name in (COORDINATOR, *participant_names())}
+        check_process_states(parts, self._node.configuration)
         return initial_state
 
     def _make_request(self, number: int, events: int) -> ResetRequest:

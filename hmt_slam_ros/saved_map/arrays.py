@@ -20,8 +20,8 @@ _ALIGNMENT = 8
 _MAX_AXES = 4
 """Axes of an array; none of the package has more than 3."""
 
-_MAX_SIZE = 2**31
-"""Elements along an axis."""
+_MAX_EMPTY = 4096
+"""Largest product of the other sizes of an array without elements, in a file that has fewer bytes."""
 
 
 class Sink(Protocol):
@@ -64,7 +64,9 @@ class ArrayReader:
 
         def read(content: object, path: str) -> NDArray[Any]:
             match content:
-                case {"type": str(found), "shape": list(shape), "at": int(at)} if found == name and _is_shape(shape):
+                case {"type": str(found), "shape": list(shape), "at": int(at)} if found == name and self._is_shape(
+                    shape
+                ):
                     count = math.prod(shape)
                     # Each byte belongs to one array: a document cannot hold more than its file.
                     self._unread -= count * size
@@ -76,6 +78,15 @@ class ArrayReader:
 
         return read
 
+    def _is_shape(self, shape: list[Any]) -> bool:
+        """Whether a list is the shape of an array of the file: at most 4 sizes, each an integer that is not negative.
+
+        An array without elements takes no byte, so that its other sizes are bounded by themselves.
+        """
+        if len(shape) > _MAX_AXES or not all(type(size) is int and size >= 0 for size in shape):
+            return False
+        return math.prod(size for size in shape if size) <= max(len(self._content), _MAX_EMPTY)
+
     def _array(self, wanted: np.dtype[Any], shape: list[int], at: int) -> NDArray[Any]:
         """A copy of the array with a shape at an offset, bytes."""
         count = math.prod(shape)
@@ -83,11 +94,6 @@ class ArrayReader:
             return (np.frombuffer(self._content, np.uint8, count, at) != 0).reshape(shape)
         flat = np.frombuffer(self._content, wanted.newbyteorder("<"), count, at)
         return flat.reshape(shape).astype(wanted)
-
-
-def _is_shape(shape: list[object]) -> bool:
-    """Whether a list is the shape of an array: at most 4 sizes, each an integer that is not negative."""
-    return len(shape) <= _MAX_AXES and all(type(size) is int and 0 <= size <= _MAX_SIZE for size in shape)
 
 
 @cache

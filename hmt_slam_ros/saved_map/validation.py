@@ -15,10 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.saved_map.field_limits import MAX_AREAS, MAX_COUNT, SYMMETRY, check_fields, require
+from hmt_slam_ros.saved_map.hypothesis_maps import (
+    HypothesisMap,
+    check_hypothesis_maps,
+    hypothesis_map,
+    require_areas,
+    require_keyframes,
+)
 from hmt_slam_ros.untrusted_input import shorten
 
 if TYPE_CHECKING:
     from hmt_slam_ros.configuration import Configuration
+
+_SUM_ERROR = 1e-6
+"""Largest difference of a sum of probabilities to 1."""
 
 _PATCH = 32
 """Cells along one edge of a patch of a grid."""
@@ -75,9 +85,11 @@ def _check_replica(replica: Any, path: str) -> None:  # noqa: ANN401
         _check_ends(change, known, f"{path}.changes")
         area = replica.robot_areas[hypothesis]
         require(not known or area in known, f"{path}.robot_areas", area, "an area of the hypothesis")
-    for graph in (common, *replica.changes.values()):
-        missing = set(graph.keyframes.tolist()) - replica.scans.keys()
+    for hypothesis in hypotheses:
+        # Areas of the common map that all hypotheses replace may have keyframes that were pruned since.
+        missing = set(hypothesis_map(replica, hypothesis).keyframes.tolist()) - replica.scans.keys()
         require(not missing, f"{path}.scans", f"without {shorten(sorted(missing))}", "a scan for every keyframe")
+    check_hypothesis_maps(replica, path)
 
 
 def _check_ends(graph: Any, areas: Set[int], path: str) -> None:  # noqa: ANN401
@@ -140,30 +152,29 @@ def _check_live_hypothesis(state: Any, path: str) -> None:  # noqa: ANN401
 def _check_slam(state: Any, path: str) -> None:  # noqa: ANN401
     live, replica = state.live_hypotheses, state.replica
     require(
-        not live or live.keys() >= replica.changes.keys(), f"{path}.live_hypotheses", list(live), "those of replica"
+        not live or live.keys() == replica.changes.keys(), f"{path}.live_hypotheses", list(live), "those of replica"
     )
     _check_events(replica, state.keyframe_events, f"{path}.keyframe_events")
     patches = 0 if state.patches is None else len(state.patches.odds)
-    for hypothesis in replica.changes.keys() & live.keys():
-        own = live[hypothesis]
+    for hypothesis, own in live.items():
         filter_state = own.particle_filter or own.line_filter
         place = f"{path}.live_hypotheses[{hypothesis}]"
         require(filter_state.hypothesis == hypothesis, place, filter_state.hypothesis, "of its own number")
-        _check_references(replica, hypothesis, filter_state, place)
+        _check_live_references(hypothesis_map(replica, hypothesis), own, filter_state, place)
         if own.particle_filter is not None:
             most = int(own.particle_filter.tables.max(initial=-1))
             require(most < patches, f"{place}.particle_filter.tables", most, f"below {patches}, the number of patches")
 
 
-def _check_references(replica: Any, hypothesis: int, own: Any, path: str) -> None:  # noqa: ANN401
-    """Check that the areas and keyframes of a filter are in the map."""
-    graphs = (replica.common, replica.changes[hypothesis])
-    areas = {area for graph in graphs for area in graph.areas.tolist()}
-    require(not areas or own.area in areas, f"{path}.area", own.area, "an area of the hypothesis")
-    missing = set(own.keyframe_areas) - areas
-    require(not missing, f"{path}.keyframe_areas", sorted(missing), "areas of the hypothesis")
-    missing = set(own.keyframes) - replica.scans.keys()
-    require(not missing, f"{path}.keyframes", sorted(missing), "keyframes of the map")
+def _check_live_references(own: HypothesisMap, live: Any, filter_state: Any, path: str) -> None:  # noqa: ANN401
+    """Check that the areas and keyframes of a live hypothesis are in its map."""
+    if own.areas:  # at first there are none
+        require_areas(own, [filter_state.area], f"{path}.area")
+    require_areas(own, filter_state.keyframe_areas, f"{path}.keyframe_areas")
+    require_keyframes(own, filter_state.keyframes, f"{path}.keyframes")
+    require_keyframes(own, [anchor for _, anchor, _ in live.scan_poses], f"{path}.scan_poses")
+    is_local = not own.areas or live.event.anchor in filter_state.keyframes
+    require(is_local, f"{path}.event.anchor", live.event.anchor, "a keyframe of the local map")
 
 
 def _check_events(replica: Any, events: int, path: str) -> None:  # noqa: ANN401
@@ -173,14 +184,20 @@ def _check_events(replica: Any, events: int, path: str) -> None:  # noqa: ANN401
 
 def _check_aam(state: Any, path: str) -> None:  # noqa: ANN401
     hypotheses = state.replica.changes.keys()
-    require(state.partitions.keys() >= hypotheses, f"{path}.partitions", list(state.partitions), "those of replica")
-    for partition in state.partitions.values():
+    require(state.partitions.keys() == hypotheses, f"{path}.partitions", list(state.partitions), "those of replica")
+    for hypothesis, partition in state.partitions.items():
+        area = state.replica.robot_areas[hypothesis]
+        require(partition.area == area, f"{path}.partitions.area", partition.area, f"{area}, the robot's area")
         own = set(partition.graphs.values())
         numbers = own | {joined.graph for joined in partition.joined_graphs.values()}
         require(numbers <= state.graphs.keys(), f"{path}.partitions.graphs", sorted(numbers), "graphs of the state")
         # Graphs of two areas keep keyframes that were pruned since.
         missing = {keyframe for n in own for keyframe in state.graphs[n].keyframes} - state.replica.scans.keys()
         require(not missing, f"{path}.graphs.keyframes", sorted(missing), "keyframes of the map")
+        for joined in partition.joined_graphs.values():
+            missing = joined.second_keyframes - set(state.graphs[joined.graph].keyframes)
+            place = f"{path}.partitions.joined_graphs.second_keyframes"
+            require(not missing, place, sorted(missing), "keyframes of the graph")
 
 
 def _check_overlap_graph(graph: Any, path: str) -> None:  # noqa: ANN401
@@ -193,16 +210,48 @@ def _check_overlap_graph(graph: Any, path: str) -> None:  # noqa: ANN401
 def _check_tsbi(state: Any, path: str) -> None:  # noqa: ANN401
     _check_area_poses("global_poses")(state, path)
     hypotheses, own = state.replica.changes.keys(), state.hypothesis_states
-    require(own.keys() >= hypotheses, f"{path}.hypothesis_states", list(own), "those of replica")
+    require(own.keys() == hypotheses, f"{path}.hypothesis_states", list(own), "those of replica")
+    total = state.unexamined + sum(state.replica.probabilities.values())
+    is_sum = abs(total - 1.0) <= _SUM_ERROR and state.unexamined < 1.0
+    require(is_sum, f"{path}.unexamined", state.unexamined, "what the probabilities of the hypotheses leave of 1")
+    for hypothesis, one in own.items():
+        _check_hypothesis_state(one, state, hypothesis_map(state.replica, hypothesis), f"{path}.hypothesis_states")
     most = max(hypotheses)
     require(state.next_hypothesis > most, f"{path}.next_hypothesis", state.next_hypothesis, f"above {most}")
 
 
+def _check_hypothesis_state(one: Any, state: Any, own: HypothesisMap, path: str) -> None:  # noqa: ANN401
+    """Check that areas and keyframes of what TSBI remembers of a hypothesis are in its map."""
+    require_areas(own, one.local_area_poses, f"{path}.local_area_poses")
+    require_areas(own, one.pending_candidates, f"{path}.pending_candidates")
+    require_keyframes(own, one.covariances, f"{path}.covariances")
+    missing = set(one.unmatched_keyframes) - one.covariances.keys()
+    require(not missing, f"{path}.unmatched_keyframes", sorted(missing), "keyframes of covariances")
+    for event, pose in one.unstored_poses.items():
+        is_stored = pose.keyframe == event and event in state.branching.unstored_scans
+        require(is_stored, f"{path}.unstored_poses", event, "an event of unstored_scans")
+    if one.is_lost:
+        lost = one.localization
+        known = (lost.candidate, lost.tracked_pose, lost.pose_hint, lost.false_alarm and lost.false_alarm.tracked_pose)
+        require_areas(own, [pose.area for pose in known if pose is not None], f"{path}.localization")
+        before = [keyframe for keyframe in one.unmatched_keyframes if keyframe < lost.since]
+        require(not before, f"{path}.localization.since", lost.since, "that of the keyframes without a match")
+    elif one.localization.relocalized_area is not None:
+        require_areas(own, [one.localization.relocalized_area], f"{path}.localization.relocalized_area")
+
+
 def _check_tlca(state: Any, path: str) -> None:  # noqa: ANN401
     hypotheses = state.replica.changes.keys()
-    for name in ("paths", "poses"):
-        own = getattr(state, name)
-        require(own.keys() >= hypotheses, f"{path}.{name}", list(own), "those of replica")
+    require(state.paths.keys() == hypotheses, f"{path}.paths", list(state.paths), "those of replica")
+    require(state.poses.keys() >= hypotheses, f"{path}.poses", list(state.poses), "those of replica")
+    for hypothesis, one in state.paths.items():
+        own, place = hypothesis_map(state.replica, hypothesis), f"{path}.paths[{hypothesis}]"
+        require(one.version <= state.change_count, f"{place}.version", one.version, f"at most {state.change_count}")
+        pairs = {tuple(sorted((arc.source, arc.target))) for arc in one.pending_arcs}
+        missing = sorted(pairs - own.arcs)
+        require(not missing, f"{place}.pending_arcs", shorten(missing), "arcs of the hypothesis")
+        ends = [area for closure in one.closures for area in (closure.near, closure.far)]
+        require_areas(own, ends, f"{place}.closures")
 
 
 def _check_record_of_run(record: Any, path: str) -> None:  # noqa: ANN401
@@ -214,6 +263,12 @@ def _check_record_of_run(record: Any, path: str) -> None:  # noqa: ANN401
         list(record.parents.items()),
         "older than their children",
     )
+    for hypothesis in record.replica.changes:
+        own = hypothesis_map(record.replica, hypothesis)
+        scans = record.scan_poses.select_hypotheses(record.lineage(hypothesis))
+        require_keyframes(own, set(scans.keyframes.tolist()) - {-1}, f"{path}.scan_poses.keyframes")
+    last = record.probabilities.keyframe[-1:].tolist()
+    require(last == [record.events - 1][: record.events], f"{path}.probabilities", last, "up to the last event")
     count = record.estimates.scans.size
     require(len(record.online_trajectory) == count, f"{path}.online_trajectory", "", f"{count} poses, as the estimates")
 
@@ -263,9 +318,19 @@ def check_run_state(parts: Mapping[str, Any], configuration: Configuration) -> N
     """
     events = parts["slam"].keyframe_events
     require(parts["recorder"].events == events, "recorder.events", parts["recorder"].events, f"{events}, as of slam")
-    reference = parts["slam"].replica
-    for name in ("aam", "tsbi", "tlca", "recorder"):
-        _check_same_map(parts[name].replica, reference, f"{name}.replica")
+    check_process_states(parts, configuration)
+
+
+def check_process_states(parts: Mapping[str, Any], configuration: Configuration) -> None:
+    """Check that states have the same maps, those of the processes and whatever else has maps.
+
+    :param parts: {part of the state: value}, each of which is checked; slam is one of them.
+    :param configuration: of the run that saved them.
+    :raises HmtSlamError: names the part that differs from that of slam.
+    """
+    for name, part in parts.items():
+        if hasattr(part, "replica"):
+            _check_same_map(part.replica, parts["slam"].replica, f"{name}.replica")
     check_slam_state(parts["slam"], configuration)
 
 
@@ -283,12 +348,14 @@ def _check_same_map(replica: Any, reference: Any, path: str) -> None:  # noqa: A
             require(same, f"{path}.{name}", getattr(graph, name), "that of slam")
 
 
-def check_slam_state(state: Any, configuration: Configuration) -> None:  # noqa: ANN401
+def check_slam_state(state: Any, configuration: Configuration, events: int | None = None) -> None:  # noqa: ANN401
     """Check that the grids of metric SLAM have the size that the parameters say.
 
+    :param events: number of keyframe events that all nodes count on from, None where it is not known.
     :raises HmtSlamError: where they have another.
     """
-
+    if events is not None:
+        require(state.keyframe_events == events, "chain.events", events, f"{state.keyframe_events}, as of slam")
     local_map, particles = configuration.local_map, configuration.filter.particles
     table = 2 * math.ceil(local_map.extent / (_PATCH * local_map.cell))
     for hypothesis, own in state.live_hypotheses.items():
