@@ -8,7 +8,7 @@ pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, 
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import AreaEvents, ClosureDecision, Hypotheses, Keyframe
-from hmt_slam_ros.ros.message_io import CHAIN, ChainOrder
+from hmt_slam_ros.ros.chain_order import CHAIN, ChainOrder
 
 
 def message(kind, sequence):

@@ -76,7 +76,7 @@ def test_a_restart_keeps_what_waits():
 )
 def test_a_laser_is_silent_only_where_the_node_could_receive_it(monkeypatch, looks, silent):
     pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
-    from hmt_slam_ros.ros.sensor_input import SensorMonitor  # noqa: PLC0415  only where there is ROS
+    from hmt_slam_ros.ros.sensor_monitor import SensorMonitor  # noqa: PLC0415  only where there is ROS
 
     messages = []
     monkeypatch.setattr(time, "monotonic", lambda: 0.0)

@@ -14,9 +14,10 @@ from hmt_slam_ros.messages.gate import MAX_REACH, check_save_folder
 from hmt_slam_ros.messages.messages import Message
 from hmt_slam_ros.messages.routing import SUBSCRIPTIONS, Checkpointable
 from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.chain_order import CHAIN
 from hmt_slam_ros.ros.initial_state import InitialState
 from hmt_slam_ros.ros.lifecycle import ManagedNode
-from hmt_slam_ros.ros.message_io import CHAIN, Inbox, subscribe_document
+from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
 from hmt_slam_ros.ros.topics import DOCUMENTS
 from hmt_slam_ros.saved_map.folder import FileRecord, FolderWriter
 

@@ -10,8 +10,10 @@ from sensor_msgs.msg import LaserScan
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.ros.diagnostics import PERIOD
+from hmt_slam_ros.ros.laser_mountings import LaserMountings, check_scan_message
 from hmt_slam_ros.ros.map_services import MapServicesNode
-from hmt_slam_ros.ros.sensor_input import LaserMountings, SensorMonitor, SensorSubscription, check_scan_message
+from hmt_slam_ros.ros.sensor_input import SensorSubscription
+from hmt_slam_ros.ros.sensor_monitor import SensorMonitor
 from hmt_slam_ros.ros.topics import SCAN
 from hmt_slam_ros.sensors import Scan
 

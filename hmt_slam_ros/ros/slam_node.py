@@ -26,12 +26,12 @@ from hmt_slam_ros.process_table import process_row
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.initial_state import InitialState, declare_initial_pose, locate_in_map
+from hmt_slam_ros.ros.laser_mountings import LaserMountings
 from hmt_slam_ros.ros.map_services import MapLoader, MapSaver, MapServicesNode, StaleSubscribers, declare_save_to
 from hmt_slam_ros.ros.message_io import subscribe_document
 from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_pose
 from hmt_slam_ros.ros.recovery import CHECKPOINT, ControlEvent, FrameMounting, PauseChange
 from hmt_slam_ros.ros.scan_intake import ScanIntake
-from hmt_slam_ros.ros.sensor_input import LaserMountings
 from hmt_slam_ros.ros.topics import INITIAL_POSE, PARTICLES
 from hmt_slam_ros.saved_map.folder import VERSION, FolderReader
 from hmt_slam_ros.sensors import Odometry, Scan

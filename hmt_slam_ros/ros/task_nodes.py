@@ -34,10 +34,10 @@ from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.execution import spin_until
 from hmt_slam_ros.ros.initial_state import InitialState, declare_start_from
+from hmt_slam_ros.ros.laser_mountings import LaserMountings, check_scan_message
 from hmt_slam_ros.ros.lifecycle import ManagedNode
 from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
 from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_pose
-from hmt_slam_ros.ros.sensor_input import LaserMountings, check_scan_message
 from hmt_slam_ros.ros.topics import (
     CMD_VEL,
     GOAL_POSE,
