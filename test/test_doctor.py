@@ -164,6 +164,108 @@ def test_odometry_that_stands_still_while_the_robot_drives_is_found(drive):
     assert subjects(log) == {"odometry frozen": "wrong"}
 
 
+def turn_start(drive):
+    """The time at which the robot turns at 20 degrees/s for the first time, s after the first reading."""
+    readings = [record.measurement for record in drive if not is_scan(record)]
+    seconds = 1e-9 * np.array([reading.stamp - readings[0].stamp for reading in readings])
+    heading = np.unwrap([reading.pose[2] for reading in readings])
+    rates = np.abs(np.interp(seconds + 0.5, seconds, heading) - np.interp(seconds - 0.5, seconds, heading))
+    return seconds[np.argmax((rates > math.radians(20.0)) & (seconds > 5.0))]
+
+
+def repeat_readings(drive, begin, seconds):
+    """Readings that repeat from a time on, and then go on at the true place."""
+    readings = [record.measurement for record in drive if not is_scan(record)]
+    first = readings[0].stamp
+    stuck = next(reading.pose for reading in readings if 1e-9 * (reading.stamp - first) >= begin)
+    return change_records(
+        drive,
+        odometry=lambda reading: (
+            replace(reading, pose=stuck) if begin <= 1e-9 * (reading.stamp - first) < begin + seconds else reading
+        ),
+    )
+
+
+def numbers_after(text, words):
+    """The first number after some words of a text."""
+    return float(text.partition(words)[2].split()[0])
+
+
+@pytest.mark.parametrize("seconds", (1.0, 2.0))
+def test_a_single_freeze_in_a_turn_is_named_with_time_duration_and_motion(drive, seconds):
+    begin = turn_start(drive)
+    log = repeat_readings(drive, begin, seconds)
+    assert subjects(log) == {"odometry frozen": "doubtful"}
+    text = text_of(log, "odometry frozen")
+    assert "stands still once" in text
+    assert numbers_after(text, "the longest time for") == pytest.approx(seconds, abs=0.3)
+    assert numbers_after(text, "s, ") == pytest.approx(begin, abs=0.3)
+    assert abs(numbers_after(text, "turned by")) > 15.0
+
+
+def test_a_robot_that_stands_has_no_frozen_odometry(drive):
+    """In the middle of the drive it stands for 10 s, in which readings and scans repeat."""
+    middle = len(drive) // 2
+    stamp = drive[middle].measurement.stamp
+    last_scan = next(record for record in reversed(drive[:middle]) if is_scan(record))
+    last_reading = next(record for record in reversed(drive[:middle]) if not is_scan(record))
+    random, standing = np.random.default_rng(0), []
+    for k in range(1, 200):
+        now = stamp + k * 50_000_000
+        standing.append(LogRecord(now, replace(last_reading.measurement, stamp=now)))
+        if k % 4 == 0:
+            noise = 0.015 * random.standard_normal(last_scan.measurement.ranges.size).astype(np.float32)
+            scan = replace(last_scan.measurement, stamp=now, ranges=last_scan.measurement.ranges + noise)
+            standing.append(LogRecord(now, scan))
+    later = [
+        LogRecord(r.source_stamp + 10**10, replace(r.measurement, stamp=r.measurement.stamp + 10**10))
+        for r in drive[middle:]
+    ]
+    assert subjects(Faulty([*drive[:middle], *standing, *later])) == {}
+
+
+@pytest.mark.parametrize(("step", "turn"), ((0.6, 0.0), (0.0, 40.0)))
+def test_a_small_jump_of_the_odometry_is_named_with_time_and_size(drive, step, turn):
+    readings = [record.measurement for record in drive if not is_scan(record)]
+    begin, at = readings[0].stamp, readings[600]
+    jump = np.array([step, 0.0, math.radians(turn)])
+    log = change_records(
+        drive,
+        odometry=lambda reading: (
+            replace(reading, pose=se2.compose(se2.compose(at.pose, jump), se2.between(at.pose, reading.pose)))
+            if reading.stamp > at.stamp
+            else reading
+        ),
+    )
+    assert subjects(log) == {"odometry jumps": "wrong"}
+    text = text_of(log, "odometry jumps")
+    assert "jumps once" in text
+    assert numbers_after(text, "farthest by") == pytest.approx(step, abs=0.1)
+    assert numbers_after(text, " m and") == pytest.approx(turn, abs=3.0)
+    assert numbers_after(text, "degrees, ") == pytest.approx(1e-9 * (at.stamp - begin), abs=0.2)
+
+
+def test_readings_that_come_in_batches_are_named_with_the_pause(drive):
+    """Of 10 s the readings are held for 0.8 s each."""
+    first, held = drive[0].measurement.stamp, 800_000_000
+
+    def arrival(record):
+        since = record.measurement.stamp - first
+        if is_scan(record) or not 30 * 10**9 <= since < 40 * 10**9:
+            return record.measurement.stamp
+        batch = -(-since // held) * held
+        return first + batch - (batch - since) // 1000
+
+    records = [replace(r, measurement=replace(r.measurement, stamp=arrival(r))) for r in drive]
+    log = Faulty(sorted(records, key=lambda record: record.measurement.stamp))
+    found = subjects(log)
+    assert found["odometry batches"] == "wrong"
+    assert not found.keys() & {"odometry frozen", "odometry jumps"}
+    text = text_of(log, "odometry batches")
+    assert numbers_after(text, "in batches") == pytest.approx(12, abs=1)
+    assert numbers_after(text, "pause takes") == pytest.approx(0.8, abs=0.06)
+
+
 def test_wheels_that_slip_are_found():
     log = open_log(WORLD + ",slips=100", duration=70.0)
     assert subjects(log) == {"slip": "doubtful"}

@@ -2,9 +2,9 @@
 
 import json
 import subprocess
-import sys
 import time
 
+import preloaded
 import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
@@ -31,10 +31,8 @@ def doctor(listener):
     """Runs it for some seconds, meanwhile spins the test's own nodes, and returns status and findings."""
 
     def run_doctor(seconds, *arguments, meanwhile=lambda: None):
-        command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "doctor", "--live", "--json"]
-        process = subprocess.Popen(
-            [*command, "--seconds", str(seconds), *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+        words = ("doctor", "--live", "--json", "--seconds", seconds, *arguments)
+        process = preloaded.start(preloaded.COMMAND, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         while process.poll() is None:
             meanwhile()
             listener.executor.spin_once(timeout_sec=0.02)

@@ -14,19 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64
-from hmt_slam_ros.configuration.robot import RealTimeParameters
-from hmt_slam_ros.doctor.finding import Finding, Severity, grade, times_text
-from hmt_slam_ros.doctor.statistics import OdometryStatistics, ScanMotions, Statistics, seconds_between
+from hmt_slam_ros.doctor.finding import Finding, Severity, grade
+from hmt_slam_ros.doctor.readings import MIN_DISTANCE, MIN_MATCHED, MIN_TURN, is_moving, is_observable, reading_findings
+from hmt_slam_ros.doctor.statistics import OdometryStatistics, ScanMotions, Statistics
 from hmt_slam_ros.geometry import se2
-
-_MIN_MATCHED = 0.45
-"""Least share of the points of a scan that match, for a motion to count."""
-
-_MIN_OBSERVABILITY = 0.1
-"""Least ratio of the information along two directions, for a translation to count."""
-
-_MIN_TURN, _MIN_DISTANCE = math.radians(1.5), 0.03
-"""Least turn, rad, and least translation, m, of a motion that is no standstill."""
 
 _OFFSET_STEP, _MAX_INTERVAL = 0.02, 0.6
 """Step between clock offsets that are tried, s, and longest time between scans that shows them, s."""
@@ -52,11 +43,8 @@ _SCALE, _YAW, _PLACE, _WRONG_FACTOR = 0.06, math.radians(3.0), 0.12, 2.5
 _BACKWARDS = math.radians(150.0)
 """Yaw error of a laser that looks backwards, rad."""
 
-_SLIPPED, _FROZEN = (0.05, 0.3), (0.03, 0.1)
-"""Shares of the moving time with slip, and with frozen odometry: doubtful, and wrong."""
-
-_MIN_PERIOD = 0.2
-"""Least period for the test on jumps, s: stamps of arrival may lie close together."""
+_SLIPPED = (0.05, 0.3)
+"""Shares of the moving time with slip: doubtful, and wrong."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +71,7 @@ class OdometryComparison:
     :ivar laser_forward: true place of the laser less the stated one, forward, m; None where the robot hardly turned.
     :ivar laser_left: the same to the left, m.
     :ivar motion_count: number of motions between well matched scans.
-    :ivar moving_count: number of these in which the robot moved by the scans.
-    :ivar frozen_count: number of these in which it stood by the odometry.
-    :ivar slip_share: share of large differences among the moving motions that are not frozen.
+    :ivar slip_share: share of large differences among those in which the robot moved, by the scans and the odometry.
     """
 
     clock_offset: float | None
@@ -96,8 +82,6 @@ class OdometryComparison:
     laser_forward: ScalarEstimate | None
     laser_left: ScalarEstimate | None
     motion_count: int
-    moving_count: int
-    frozen_count: int
     slip_share: float
 
 
@@ -106,7 +90,7 @@ def compare_odometry(odometry: OdometryStatistics, motions: ScanMotions) -> Odom
     if len(odometry.stamps) < 2:
         return None
     inside = (motions.starts >= odometry.stamps[0]) & (motions.ends <= odometry.stamps[-1])
-    motions = motions.select(inside & (motions.matched >= _MIN_MATCHED))
+    motions = motions.select(inside & (motions.matched >= MIN_MATCHED))
     if len(motions.starts) < _MIN_MOTIONS:
         return None
     offset = _clock_offset(odometry, motions)
@@ -132,13 +116,7 @@ def _odometry_motions(odometry: OdometryStatistics, motions: ScanMotions, offset
 
 def _is_frozen(measured: Float64, scanned: Float64) -> Bool:
     """Whether the odometry of each motion stands still although the scans clearly move."""
-    return _is_moving(scanned, 2.0) & (np.abs(measured) < 1e-6).all(axis=1)
-
-
-def _is_moving(motions: Float64, times: float) -> Bool:
-    return (np.hypot(motions[:, 0], motions[:, 1]) > times * _MIN_DISTANCE) | (
-        np.abs(motions[:, 2]) > times * _MIN_TURN
-    )
+    return is_moving(scanned, 2.0) & (np.abs(measured) < 1e-6).all(axis=1)
 
 
 def _clock_offset(odometry: OdometryStatistics, motions: ScanMotions) -> float | None:
@@ -146,7 +124,7 @@ def _clock_offset(odometry: OdometryStatistics, motions: ScanMotions) -> float |
     seconds = (motions.ends - motions.starts) * 1e-9
     chosen = motions.select(seconds < _MAX_INTERVAL)
     turns = chosen.motions[:, 2]
-    if np.abs(turns[np.abs(turns) > _MIN_TURN]).sum() < _MIN_TOTAL_TURN:
+    if np.abs(turns[np.abs(turns) > MIN_TURN]).sum() < _MIN_TOTAL_TURN:
         return None
     correlations = np.array(
         [abs(_correlation(_odometry_motions(odometry, chosen, offset)[:, 2], turns)) for offset in _OFFSETS]
@@ -166,13 +144,13 @@ def _correlation(one: Float64, other: Float64) -> float:
 
 
 def _clip_outliers(series: Float64) -> Float64:
-    limit = max(_MIN_TURN, float(np.percentile(np.abs(series), 98)))
+    limit = max(MIN_TURN, float(np.percentile(np.abs(series), 98)))
     return np.clip(series, -limit, limit)
 
 
 def _rotation_scale(measured: Float64, scanned: Float64) -> ScalarEstimate | None:
     """The ratio of turns by odometry to turns by scans, each of shape (n,)."""
-    turning = np.abs(scanned) > _MIN_TURN
+    turning = np.abs(scanned) > MIN_TURN
     if turning.sum() < _MIN_MOTIONS or np.abs(scanned[turning]).sum() < _MIN_TOTAL_TURN:
         return None
     values, covariance = _robust_fit(scanned[turning, None], measured[turning], np.ones(turning.sum()))
@@ -197,8 +175,8 @@ def _estimate_comparison(
     scanned = motions.motions
     turn_scale = rotation.value if rotation is not None else 1.0
     usable = ~frozen & (np.abs(measured[:, 2] - turn_scale * scanned[:, 2]) < np.radians(5.0))
-    turning = np.abs(scanned[:, 2]) > _MIN_TURN
-    going = usable & (_is_observable(motions) > 0.0) & (np.hypot(scanned[:, 0], scanned[:, 1]) > _MIN_DISTANCE)
+    turning = np.abs(scanned[:, 2]) > MIN_TURN
+    going = usable & (is_observable(motions) > 0.0) & (np.hypot(scanned[:, 0], scanned[:, 1]) > MIN_DISTANCE)
     translation = yaw = forward = left = None
     lever = rotation is not None and (usable & turning).sum() >= _MIN_MOTIONS
     values = np.array([0.0, 0.0, 1.0, 0.0])
@@ -212,7 +190,7 @@ def _estimate_comparison(
         if lever:
             forward, left = (ScalarEstimate(float(values[k]), math.sqrt(covariance[k, k])) for k in (0, 1))
     differences = _residuals(measured, scanned, values, turn_scale)
-    moving = _is_moving(scanned, 1.0)
+    moving = is_moving(scanned, 1.0)
     slipped = _slip_share(differences, motions, moving & ~frozen)
     return OdometryComparison(
         offset,
@@ -223,8 +201,6 @@ def _estimate_comparison(
         forward,
         left,
         len(scanned),
-        int(moving.sum()),
-        int(frozen.sum()),
         slipped,
     )
 
@@ -241,14 +217,8 @@ def _fit_mounting(measured: Float64, motions: ScanMotions, *, lever: bool) -> tu
     rows = np.stack([np.stack([cos - 1.0, -sin, -x, y], axis=1), np.stack([sin, cos - 1.0, -y, -x], axis=1)], axis=1)
     if not lever:
         rows[:, :, :2] = 0.0
-    weights = _is_observable(motions)
+    weights = is_observable(motions)
     return _robust_fit(rows.reshape(-1, 4), -measured[:, :2].reshape(-1), np.repeat(weights, 2))
-
-
-def _is_observable(motions: ScanMotions) -> Float64:
-    """1 for each motion, of p, that the scans show in all directions, else 0."""
-    spectra = np.linalg.eigvalsh(motions.information[:, :2, :2])
-    return (spectra[:, 0] > _MIN_OBSERVABILITY * spectra[:, 1]).astype(np.float64)
 
 
 def _residuals(measured: Float64, scanned: Float64, values: Float64, turn_scale: float) -> Float64:
@@ -262,7 +232,7 @@ def _residuals(measured: Float64, scanned: Float64, values: Float64, turn_scale:
 
 def _slip_share(differences: Float64, motions: ScanMotions, moving: Bool) -> float:
     """Share of large differences among the moving motions, a mask of shape (p,)."""
-    observable = _is_observable(motions) > 0.0
+    observable = is_observable(motions) > 0.0
     away = np.hypot(differences[:, 0], differences[:, 1])
     length = np.hypot(motions.motions[:, 0], motions.motions[:, 1])
     turned = np.abs(differences[:, 2])
@@ -288,8 +258,8 @@ def _robust_fit(rows: Float64, targets: Float64, weights: Float64) -> tuple[Floa
 
 def odometry_findings(statistics: Statistics, comparison: OdometryComparison | None) -> Iterator[Finding]:
     """Findings on the odometry, alone and compared with the scans."""
-    yield from _check_finite(statistics.odometry)
-    yield from _check_jumps(statistics.odometry)
+    offset = (comparison.clock_offset if comparison else None) or 0.0
+    yield from reading_findings(statistics.odometry, statistics.motions, offset)
     if comparison is None:
         text = (
             f"Odometry could not be compared with the scans: of {len(statistics.motions.starts)} motions from scan to "
@@ -302,41 +272,12 @@ def odometry_findings(statistics: Statistics, comparison: OdometryComparison | N
     yield from _check_translation(comparison.translation_scale)
     yield from _check_laser_yaw(comparison.laser_yaw)
     yield from _check_laser_position(comparison)
-    yield from _check_frozen(comparison)
     yield from _check_slip(comparison)
     yield _summary(comparison)
 
 
 def _severity(excess: float) -> Severity:
     return "wrong" if excess >= _WRONG_FACTOR else "doubtful" if excess >= 1.0 else "fine"
-
-
-def _check_finite(odometry: OdometryStatistics) -> Iterator[Finding]:
-    if not odometry.non_finite_count:
-        return
-    text = (
-        f"{odometry.non_finite_count} odometry readings are NaN or infinite and were left out: look for a division by "
-        "zero in the odometry's driver, or a quaternion of zeros."
-    )
-    yield Finding("wrong", "odometry not finite", text)
-
-
-def _check_jumps(odometry: OdometryStatistics) -> Iterator[Finding]:
-    if len(odometry.stamps) < 2:
-        return
-    seconds = np.maximum(seconds_between(odometry.stamps), _MIN_PERIOD)
-    steps = se2.between(odometry.poses[:-1], odometry.poses[1:])
-    distance = np.hypot(steps[:, 0], steps[:, 1])
-    jumps = distance > RealTimeParameters().max_speed * seconds
-    if not jumps.any():
-        return
-    k = int(np.argmax(np.where(jumps, distance, 0.0)))
-    text = (
-        f"The odometry jumps {times_text(int(jumps.sum()))}, the farthest by {distance[k]:.2f} m, "
-        f"{(odometry.stamps[k] - odometry.stamps[0]) * 1e-9:.1f} s after its first reading: it was reset, or two "
-        "sources publish it; it must be one path without jumps (REP 105)."
-    )
-    yield Finding("wrong", "odometry jumps", text)
 
 
 def _check_mirrored(comparison: OdometryComparison) -> Iterator[Finding]:
@@ -417,17 +358,6 @@ def _check_laser_position(comparison: OdometryComparison) -> Iterator[Finding]:
         "odometry's child frame if that is not between the wheels."
     )
     yield Finding(severity, "laser place", text)
-
-
-def _check_frozen(comparison: OdometryComparison) -> Iterator[Finding]:
-    share = comparison.frozen_count / max(1, comparison.moving_count)
-    if (severity := grade(share, *_FROZEN)) == "fine":
-        return
-    text = (
-        f"The odometry stands still in {100.0 * share:.0f} % of the time in which the scans move: its readings are "
-        "repeated, or it is not published while the robot moves by other means; look at its driver."
-    )
-    yield Finding(severity, "odometry frozen", text)
 
 
 def _check_slip(comparison: OdometryComparison) -> Iterator[Finding]:
