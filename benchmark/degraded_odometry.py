@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmark.real_faults.stream import chain_increments
 from hmt_slam_ros.cli.arguments import build_parser, chosen_configuration
 from hmt_slam_ros.cli.run_commands import run_measured
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
@@ -111,15 +112,7 @@ def degrade_log(log: Log, kind: str, seed: int) -> DegradedLog:
         errors = _slip_errors(np.array([reading.stamp for reading in readings]) / NANOSECONDS, increments, random)
     else:
         errors = _noise_errors(increments, {"noise-2x": 2.0, "noise-4x": 4.0}[kind], random)
-    return DegradedLog(log, kind, dict(enumerate(_chain(poses[0], se2.compose(increments, errors)))))
-
-
-def _chain(first: NDArray[np.float64], increments: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Poses (3,) that begin at ``first`` and follow the increments (n, 3)."""
-    poses = [first]
-    for increment in increments:
-        poses.append(se2.compose(poses[-1], increment))
-    return poses
+    return DegradedLog(log, kind, dict(enumerate(chain_increments(poses[0], se2.compose(increments, errors)))))
 
 
 def _noise_errors(increments: NDArray[np.float64], factor: float, random: np.random.Generator) -> NDArray[np.float64]:

@@ -24,12 +24,14 @@ VARIABLE = "HMT_SLAM_DATASETS"
 _FILES = {
     "aces": ("aces.clf.xz", "aces.relations.xz"),
     "intel": ("intel.clf.xz", "intel.relations.xz"),
+    "csail": ("csail.clf.xz", "csail.relations.xz"),
     "edmonton": ("edmonton.kf.clf.xz", None),
     "freiburg-101": ("freiburg-101.kf.clf.xz", None),
 }
 BUNDLED = "malaga"
 LOGS = (*_FILES, BUNDLED)
-WITH_RELATIONS = tuple(name for name, (_, relations) in _FILES.items() if relations)
+WITH_RELATIONS = ("aces", "intel")
+"""The logs with true relations that are mapped as a whole, unless others are chosen."""
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ class Report:
             "requirements": [vars(requirement) | {"met": requirement.is_met} for requirement in self.requirements],
             **self.data,
         }
-        text = json.dumps(_make_json_safe(content), indent=1, allow_nan=False)
+        text = json.dumps(make_json_safe(content), indent=1, allow_nan=False)
         (folder / f"{self.kind}.json").write_text(text + "\n", encoding="utf-8")
 
 
@@ -157,12 +157,12 @@ def _format_number(value: float, unit: str) -> str:
     return f"{value:.4g} {unit}".strip()
 
 
-def _make_json_safe(value: Any) -> Any:  # noqa: ANN401  any content of a report
+def make_json_safe(value: Any) -> Any:  # noqa: ANN401  any content of a report
     """The same value with None for numbers that JSON does not have."""
     if isinstance(value, Mapping):
-        return {str(key): _make_json_safe(entry) for key, entry in value.items()}
+        return {str(key): make_json_safe(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_make_json_safe(entry) for entry in value]
+        return [make_json_safe(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -1,165 +1,243 @@
-"""Accuracy and topology under degraded odometry."""
+"""Topology under faults of real sensors: stretches of recorded and simulated logs, each with one kind of fault."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from benchmark.degraded_odometry import KINDS
-from benchmark.logs import WITH_RELATIONS, MeasuredLog, open_logs
-from benchmark.report import Report, Requirement, table
-from benchmark.runs import Case, Run
-from benchmark.scoring import FINAL, over_seeds, score
+from benchmark.logs import MeasuredLog, open_logs
+from benchmark.real_faults.faulty_run import FINDINGS, NONE, VERDICT
+from benchmark.real_faults.kinds import BY_NAME, KINDS, Kind
+from benchmark.real_faults.stretches import FULL_TURN, RECORDED, SOURCES, LogStretch, draw_stretch
+from benchmark.real_faults.verdict import POLICY
+from benchmark.report import Columns, Report, Requirement, mean, table_of
+from benchmark.runs import CachedRunner, Case, Run
 from benchmark.settings import Settings
-from hmt_slam_ros.evaluation import RelationErrors, read_tum
-from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue
-from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
+from benchmark.simulated.records import code_hash
+from hmt_slam_ros.errors import HmtSlamError
 
-SEEDS = 5
+SEEDS = 18
+"""Cases of every kind: 306 in all."""
 
-LONG_LIMIT = 1.0
-"""Largest error of a relation over more than 60 s in a map of the right topology, m."""
+LEAST_RIGHT, MOST_WRONG = 0.98, 0.01
+"""Least share of maps that are right, and largest share of those that are wrong with confidence."""
 
-CLOSURE_LIMIT, CLOSURE_ANGLE = 0.5, 10.0
-"""Largest error of an arc that closed a true loop, m and degrees."""
+_NOT_MAPPING = ("cli", "doctor", "exploration", "ros", "view")
+"""Packages on which maps do not depend."""
 
-POLICY = (
-    "The kinds are those of `benchmark/degraded_odometry.py`, with random numbers of the run's seed. A map has the "
-    f"right topology if every relation over more than 60 s is within {LONG_LIMIT:g} m of the truth, and every arc that "
-    f"closed a loop is within {CLOSURE_LIMIT:g} m and {CLOSURE_ANGLE:g} degrees of the run of the same seed with the "
-    "recorded odometry, between the two keyframes of its areas that are nearest to each other there. Errors are means "
-    "over all seeds, including those with a wrong topology; relations are matched as for accuracy."
+CASES_POLICY = (
+    "Each case is a stretch of a log with one kind of fault. Stretches of recorded logs take 300 to 900 s and have ten "
+    "true relations over more than 60 s at least; simulated drives are whole. The number of the stretch draws the "
+    "stretch, the places of the fault, and the numbers of the run. All kinds have the same stretches, except where a "
+    "fault needs a laser with two beams a degree or a view all around. *Alone* is the same stretch without the fault. "
+    "Errors are medians over the cases of the mean error of all relations. The doctor names a fault if it has a "
+    "finding of that kind that it does not have without the fault."
 )
 
 
 @dataclass(frozen=True)
-class TopologyVerdict:
-    """The verdict on the topology of a run.
+class FaultCase(Case):
+    """A stretch with a fault.
 
-    :ivar scores: of the final trajectory; None for a run that failed.
-    :ivar closures: errors of the arcs that closed a loop.
+    :ivar task: "map" or "doctor".
+    :ivar reference: output folder of the run without the fault, if that is right.
     """
 
-    scores: RelationErrors | None
-    closures: tuple[ClosureError, ...] = ()
+    task: str = "map"
+    reference: Path | None = None
 
     @property
-    def wrong_closures(self) -> list[ClosureError]:
-        """The arcs that closed a false loop."""
-        return [c for c in self.closures if not (c.translation <= CLOSURE_LIMIT and c.rotation <= CLOSURE_ANGLE)]
+    def name(self) -> str:
+        """Of the output folder."""
+        return f"{self.task}-{super().name}"
 
-    @property
-    def is_right(self) -> bool:
-        """Whether no loop is missed, and none is false."""
-        if self.scores is None:
-            return False
-        return self.scores.over_60_s.translation.max <= LONG_LIMIT and not self.wrong_closures
-
-
-def measure_robustness(settings: Settings) -> Report:
-    """Map every log with every kind of degraded odometry and every seed."""
-    seeds = settings.seeds_or(SEEDS)
-    report = Report("robustness", "Accuracy with degraded odometry", seeds=seeds)
-    rows: list[list[str]] = []
-    with open_logs(settings.logs_or(WITH_RELATIONS)) as logs:
-        for log in logs:
-            references = settings.runner.runs([Case(log, seed, "", settings.changes) for seed in seeds])
-            for kind in ("", *KINDS):
-                runs = settings.runner.attempts([Case(log, seed, kind, settings.changes) for seed in seeds])
-                verdicts = [judge_run(run, reference) for run, reference in zip(runs, references, strict=True)]
-                name = kind or "as recorded"
-                wrong = sum(not verdict.is_right for verdict in verdicts)
-                report.requirements.append(Requirement(f"{log.name}, {name}: seeds with a wrong topology", wrong, 0))
-                report.data[f"{log.name} {name}"] = [
-                    asdict(verdict) | {"right": verdict.is_right} for verdict in verdicts
-                ]
-                rows.append([log.name, name, *_verdict_cells(runs, verdicts)])
-    head = ["log", "odometry", "translation [m]", "between seeds", "worst seed", "over 60 s [m]", "its max"]
-    head += ["rotation [deg]", "areas", "loop closures", "wrong ones", "right topology"]
-    report.body += [table(head, rows), POLICY]
-    return report
-
-
-def judge_run(run: Run, reference: Run) -> TopologyVerdict:
-    """The verdict on a run by the truth, and by the run with the recorded odometry."""
-    if run.fault:
-        return TopologyVerdict(None)
-    closures = closure_errors(read_saved_map(run.folder / "hmt_map"), _true_poses(reference))
-    return TopologyVerdict(score(run.folder, run.case.log), tuple(closures))
-
-
-def _true_poses(reference: Run) -> dict[int, NDArray[np.float64]]:
-    log: MeasuredLog = reference.case.log
-    poses = read_tum(reference.folder / FINAL).poses
-    # The run may be of the beginning of the log.
-    return {scan.stamp: pose for scan, pose in zip(log.scans[: len(poses)], poses, strict=True)}
-
-
-def _verdict_cells(runs: Sequence[Run], verdicts: Sequence[TopologyVerdict]) -> list[str]:
-    scores = [verdict.scores for verdict in verdicts if verdict.scores is not None]
-    right = f"{sum(verdict.is_right for verdict in verdicts)} of {len(verdicts)}"
-    if not scores:
-        return [*["-"] * 9, right]
-    mean = over_seeds(scores)
-    reports = [run.report for run in runs if not run.fault]
-    return [
-        f"{mean.translation:.3f}",
-        f"± {mean.translation_std:.3f}",
-        f"{mean.worst:.3f}",
-        f"{mean.long:.3f}",
-        f"{mean.long_max:.2f}",
-        f"{mean.rotation:.2f}",
-        f"{np.mean([report['areas'] for report in reports]):.1f}",
-        f"{np.mean([report['loop_closures'] for report in reports]):.1f}",
-        str(sum(len(verdict.wrong_closures) for verdict in verdicts)),
-        right,
-    ]
+    def command(self, folder: Path) -> list[str]:
+        """The command line that maps or examines the stretch into a folder."""
+        program = [sys.executable, "-m", "benchmark.real_faults.faulty_run", self.task, self.kind, str(self.log.path)]
+        options: dict[str, object] = {"--start": self.start, "--duration": self.duration}
+        options |= {"--relations": self.log.relations_file, "--reference": self.reference}
+        words = [word for name, value in options.items() if value for word in (name, str(value))]
+        changes = [word for change in self.changes for word in ("--set", change)]
+        return [*program, "--out", str(folder), "--seed", str(self.seed), *words, *changes]
 
 
 @dataclass(frozen=True)
-class ClosureError:
-    """The error of an arc that closed a loop.
+class Attempt:
+    """A stretch with a fault, and alone.
 
-    :ivar areas: that it joins.
-    :ivar translation: m.
-    :ivar rotation: degrees.
+    :ivar kind: of the fault; None for the stretch alone.
+    :ivar stretch: its name.
+    :ivar run: of the map; its fault is not empty where it failed.
+    :ivar alone: of the same stretch without the fault.
+    :ivar is_named: whether the doctor names the fault; None where it need not.
     """
 
-    areas: tuple[int, int]
-    translation: float
-    rotation: float
+    kind: Kind | None
+    stretch: str
+    run: Run
+    alone: Run
+    is_named: bool | None = None
+
+    @cached_property
+    def verdict(self) -> dict[str, Any]:
+        """The content of verdict.json."""
+        return read_verdict(self.run)
+
+    @property
+    def outcome(self) -> str:
+        """``right``, ``wrong``, ``open`` or ``failed``."""
+        return str(self.verdict["outcome"])
 
 
-def closure_errors(saved: SavedMap, truth: Mapping[int, NDArray[np.float64]]) -> list[ClosureError]:
-    """Errors of all arcs of the most probable map that closed a loop.
+def read_verdict(run: Run) -> dict[str, Any]:
+    """The content of a run's verdict.json; a failed run has an outcome alone."""
+    if run.fault:
+        return {"outcome": "failed", "error": None}
+    content: dict[str, Any] = json.loads((run.folder / VERDICT).read_text(encoding="utf-8"))
+    return content
 
-    The error is that between the two keyframes of its areas that truly are nearest to each other.
 
-    :param truth: {running stamp of a scan, ns: ``map_T_base`` (3,)}, of all scans of the log, in any one frame.
+def measure_robustness(settings: Settings) -> Report:
+    """Map stretches with every kind of fault."""
+    seeds = settings.seeds_or(SEEDS)
+    report = Report("robustness", "Topology under faults of real sensors", seeds=seeds)
+    kinds, sources = _choose(settings.logs)
+    with open_logs([name for name in RECORDED if name in sources]) as recorded:
+        logs = {log.name: log for log in recorded}
+        pairs = [(kind, stretch) for kind in kinds for stretch in _draw_stretches(kind, sources, seeds, logs)]
+        attempts = _attempt(pairs, settings)
+    alone = {attempt.stretch: replace(attempt, kind=None, run=attempt.alone, is_named=None) for attempt in attempts}
+    report.requirements += requirements(attempts)
+    report.body += [outcome_table(kinds, list(alone.values()), attempts), POLICY, CASES_POLICY]
+    report.body.append("\n".join(f"- **{kind.name}**: {kind.description}" for kind in kinds))
+    report.data["attempts"] = [
+        {
+            "kind": attempt.kind.name if attempt.kind else NONE,
+            "stretch": attempt.stretch,
+            "cpu_s": attempt.run.cpu_seconds,
+            "fault": attempt.run.fault,
+            "named": attempt.is_named,
+            **attempt.verdict,
+        }
+        for attempt in [*alone.values(), *attempts]
+    ]
+    return report
+
+
+def _choose(names: Sequence[str]) -> tuple[list[Kind], tuple[str, ...]]:
+    """The kinds and the sources that are chosen, by default all.
+
+    :raises HmtSlamError: for an unknown name, or where no kind can be planted into the sources.
     """
-    arcs = saved.replica.maps[saved.replica.best_hypothesis].all_arcs()
-    return [_closure_error(saved, a, b, arc, truth) for a, b, arc in arcs if arc.closure]
+    known = (*SOURCES, *FULL_TURN)
+    for name in names:
+        if name not in (*known, *BY_NAME):
+            raise HmtSlamError(f"there is no stretch or fault {name!r}: choose from {', '.join((*known, *BY_NAME))}")
+    sources = tuple(source for source in known if source in names) or known
+    chosen = [kind for kind in KINDS if kind.name in names] or KINDS
+    kinds = [kind for kind in chosen if set(kind.sources) & set(sources)]
+    if not kinds:
+        raise HmtSlamError(f"no fault of {', '.join(names)} can be planted there: choose other stretches")
+    return kinds, sources
 
 
-def _closure_error(
-    saved: SavedMap, a: int, b: int, arc: ArcValue, truth: Mapping[int, NDArray[np.float64]]
-) -> ClosureError:
-    (a_T_keyframes, true_in_a), (b_T_keyframes, true_in_b) = (_keyframe_poses(saved, area, truth) for area in (a, b))
-    distances = np.hypot(*(true_in_a[:, None, :2] - true_in_b[None, :, :2]).transpose(2, 0, 1))
-    k, m = np.unravel_index(np.argmin(distances), distances.shape)
-    through_arc = se2.between(a_T_keyframes[k], se2.compose(arc.pose.mean, b_T_keyframes[m]))
-    error = se2.between(se2.between(true_in_a[k], true_in_b[m]), through_arc)
-    return ClosureError((a, b), float(np.hypot(error[0], error[1])), float(np.degrees(abs(error[2]))))
+def _draw_stretches(
+    kind: Kind, sources: Sequence[str], seeds: Sequence[int], logs: dict[str, MeasuredLog]
+) -> list[LogStretch]:
+    """The stretches for a kind of fault, from its sources in turn."""
+    own = [source for source in kind.sources if source in sources]
+    return [draw_stretch(own[seed % len(own)], seed // len(own), logs) for seed in seeds]
 
 
-def _keyframe_poses(
-    saved: SavedMap, area: int, truth: Mapping[int, NDArray[np.float64]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Poses (n, 3) of an area's keyframes in the area, and true ones."""
-    keyframes = saved.replica.maps[saved.replica.best_hypothesis].keyframes(area)
-    poses = np.array(list(keyframes.values())).reshape(-1, 3)
-    return poses, np.array([truth[saved.replica.scans[keyframe].stamp] for keyframe in keyframes]).reshape(-1, 3)
+def _attempt(pairs: Sequence[tuple[Kind, LogStretch]], settings: Settings) -> list[Attempt]:
+    """Map and examine the stretches, first all of them alone."""
+    folder, jobs = settings.records.folder / "robustness", settings.records.jobs
+    mapping = CachedRunner(folder, jobs, code_hash("benchmark/real_faults", _NOT_MAPPING))
+    examining = CachedRunner(folder, jobs, code_hash("benchmark/real_faults"))
+    bare = [_case(NONE, stretch, settings) for _, stretch in pairs]
+    alone = mapping.attempts(bare)
+    faulty = [
+        replace(case, kind=kind.name, reference=run.folder if read_verdict(run)["outcome"] == "right" else None)
+        for (kind, _), case, run in zip(pairs, bare, alone, strict=True)
+    ]
+    runs = mapping.attempts(faulty)
+    named = [kind.subjects for kind, _ in pairs]
+    examined = _examine([case for case, subjects in zip(bare, named, strict=True) if subjects], NONE, examining)
+    findings = _examine([case for case, subjects in zip(faulty, named, strict=True) if subjects], "", examining)
+    answers = iter(zip(examined, findings, strict=True))
+    return [
+        Attempt(kind, stretch.name, run, base, is_named(kind.subjects, *next(answers)) if kind.subjects else None)
+        for (kind, stretch), run, base in zip(pairs, runs, alone, strict=True)
+    ]
+
+
+def _case(kind: str, stretch: LogStretch, settings: Settings) -> FaultCase:
+    return FaultCase(stretch.log, stretch.number, kind, settings.changes, stretch.duration, stretch.start)
+
+
+def _examine(cases: Sequence[FaultCase], kind: str, runner: CachedRunner) -> list[list[dict[str, str]]]:
+    """What the doctor finds in the stretches.
+
+    :raises HmtSlamError: where it fails.
+    """
+    runs = runner.runs([replace(case, task="doctor", reference=None, kind=kind or case.kind) for case in cases])
+    return [json.loads((run.folder / FINDINGS).read_text(encoding="utf-8"))["findings"] for run in runs]
+
+
+def is_named(subjects: Sequence[str], without: Sequence[dict[str, str]], found: Sequence[dict[str, str]]) -> bool:
+    """Whether findings name a fault that those without it do not name.
+
+    :param subjects: of the findings that name it.
+    """
+    before = {one["text"] for one in without}
+    return any(one["subject"] in subjects and one["severity"] != "fine" and one["text"] not in before for one in found)
+
+
+def requirements(attempts: Sequence[Attempt]) -> list[Requirement]:
+    """The requirements on all cases."""
+    right, wrong = (mean([attempt.outcome == outcome for attempt in attempts]) for outcome in ("right", "wrong"))
+    return [
+        Requirement("cases with the right topology, share", right, math.inf, least=LEAST_RIGHT),
+        Requirement("cases that are wrong with confidence, share", wrong, MOST_WRONG),
+    ]
+
+
+def outcome_table(kinds: Sequence[Kind], alone: Sequence[Attempt], attempts: Sequence[Attempt]) -> str:
+    """A table with a line for the stretches alone, for every kind of fault, and for all."""
+    groups = [(kind.name, [attempt for attempt in attempts if attempt.kind == kind]) for kind in kinds]
+    columns: Columns[tuple[str, Sequence[Attempt]]] = [
+        ("fault", lambda row: row[0]),
+        ("cases", lambda row: str(len(row[1]))),
+        ("right", lambda row: _count(row[1], "right")),
+        ("alone right", lambda row: str(sum(read_verdict(one.alone)["outcome"] == "right" for one in row[1]))),
+        ("wrong with confidence", lambda row: _count(row[1], "wrong")),
+        ("open", lambda row: _count(row[1], "open")),
+        ("failed", lambda row: _count(row[1], "failed")),
+        ("error [m]", lambda row: _median_error([one.verdict for one in row[1]])),
+        ("alone [m]", lambda row: _median_error([read_verdict(one.alone) for one in row[1]])),
+        ("named by the doctor", lambda row: _count_named(row[1])),
+        ("CPU [s]", lambda row: f"{sum(one.run.cpu_seconds for one in row[1]):.0f}"),
+    ]
+    return table_of(columns, [("none", alone), *groups, ("**all**", attempts)])
+
+
+def _count(attempts: Sequence[Attempt], outcome: str) -> str:
+    return str(sum(attempt.outcome == outcome for attempt in attempts))
+
+
+def _median_error(verdicts: Sequence[dict[str, Any]]) -> str:
+    errors = [verdict["error"] for verdict in verdicts if verdict["error"] is not None]
+    return f"{np.median(errors):.3f}" if errors else "-"
+
+
+def _count_named(attempts: Sequence[Attempt]) -> str:
+    named = [attempt.is_named for attempt in attempts if attempt.is_named is not None]
+    return f"{sum(named)} of {len(named)}" if named else "-"

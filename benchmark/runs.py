@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -121,6 +122,31 @@ class Runner:
     def _run(self, case: Case) -> Run:
         run = run_case(case, self.folder.absolute() / case.name)
         print(f"{case.name}: {run.cpu_seconds:.1f} CPU s {run.fault}".rstrip(), file=sys.stderr, flush=True)
+        return run
+
+
+class CachedRunner(Runner):
+    """A runner that keeps runs in their folder, for the same program and parameters.
+
+    :ivar fingerprint: of the program, which identifies its runs.
+    """
+
+    def __init__(self, folder: Path, jobs: int, fingerprint: str) -> None:
+        super().__init__(folder, jobs)
+        self.fingerprint = fingerprint
+
+    def _run(self, case: Case) -> Run:
+        folder = self.folder.absolute() / case.name
+        usage_file = folder / "usage.json"
+        if usage_file.is_file():
+            usage: dict[str, Any] = json.loads(usage_file.read_text(encoding="utf-8"))
+            if usage.pop("code") == self.fingerprint:
+                return Run(case, folder, **usage)
+        shutil.rmtree(folder, ignore_errors=True)
+        run = super()._run(case)
+        if not run.fault:
+            usage = {"cpu_seconds": run.cpu_seconds, "wall_seconds": run.wall_seconds, "peak_rss": run.peak_rss}
+            usage_file.write_text(json.dumps(usage | {"code": self.fingerprint}), encoding="utf-8")
         return run
 
 

@@ -29,6 +29,7 @@ from hmt_slam_ros.results.log_reading import LogProgress
 from hmt_slam_ros.results.record import EstimateTable, ProbabilityTable, ScanPoseTable, TopologyProbability
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_filter import ParticleFilterState
+from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
 
 BEAMS = 181
 """Beams of the scans that are saved or measured."""
@@ -109,7 +110,11 @@ def state_of(lattice: Lattice, configuration: Configuration) -> RunState:
     covariances = KeyframeCovariances.from_dict(dict.fromkeys(keyframes, ARC))
     live = {
         hypothesis: replace(
-            own, keyframe_covariances=covariances, particle_filter=_at_first_keyframes(own.particle_filter, keyframes)
+            own,
+            keyframe_covariances=covariances,
+            particle_filter=_at_first_keyframes(own.particle_filter, keyframes),
+            event=replace(own.event, anchor=keyframes[0]),
+            scan_poses=(),
         )
         for hypothesis, own in drive_state.processes["slam"].live_hypotheses.items()
     }
@@ -129,7 +134,12 @@ def state_of(lattice: Lattice, configuration: Configuration) -> RunState:
             "aam": replace(
                 drive_state.processes["aam"], replica=replica, graphs=graphs, partitions={FIRST_HYPOTHESIS: partition}
             ),
-            "tsbi": replace(drive_state.processes["tsbi"], replica=replica, global_poses=lattice.poses()),
+            "tsbi": replace(
+                drive_state.processes["tsbi"],
+                replica=replica,
+                global_poses=lattice.poses(),
+                hypothesis_states={FIRST_HYPOTHESIS: HypothesisState()},
+            ),
             "tlca": replace(drive_state.processes["tlca"], replica=replica, paths={FIRST_HYPOTHESIS: path}),
             "rtl": replace(drive_state.processes["rtl"], area_poses=lattice.poses()),
         },
@@ -174,7 +184,7 @@ def _recorder_fields(keyframes: Sequence[int]) -> dict[str, Any]:
     each = zip(np.split(scans, len(keyframes)), np.split(stamps, len(keyframes)), keyframes, strict=True)
     rows = [
         TopologyProbability(event, 0, 0.0, FIRST_HYPOTHESIS, FIRST_HYPOTHESIS, 1.0, 0, 1, 0, True, 0.0)
-        for event in range(len(keyframes))
+        for event in keyframes
     ]
     return {
         "events": max(keyframes) + 1,

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import lzma
-import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,9 +19,9 @@ from matplotlib.figure import Figure
 from benchmark import charted_run
 from benchmark.charted_run import AREAS, METRIC
 from benchmark.logs import BUNDLED, MeasuredLog, dataset_folder, open_logs
+from benchmark.odometry import LONG_LIMIT
 from benchmark.report import Report, Requirement, table
-from benchmark.robustness import LONG_LIMIT
-from benchmark.runs import PARAMETERS, Case, Run, Runner
+from benchmark.runs import PARAMETERS, CachedRunner, Case, Run, Runner
 from benchmark.scoring import FINAL
 from benchmark.settings import Settings
 from benchmark.simulated.records import code_hash
@@ -138,7 +136,7 @@ def measure_table(settings: Settings) -> Report:
     if strange := [name for name in names if name not in EXTENTS]:
         raise HmtSlamError(f"there is no {strange[0]!r} to compare on: choose from {', '.join(EXTENTS)}")
     report = Report("table", "Time and memory against a global metric RBPF", seeds=seeds)
-    runner = CachedRunner(settings.records.folder / "table", jobs=1)
+    runner = CachedRunner(settings.records.folder / "table", jobs=1, fingerprint=_fingerprint())
     with open_compared_logs(names) as logs:
         _compile_kernels()
         found = {log.name: _compare_log(log, seeds, settings.changes, runner) for log in logs}
@@ -269,24 +267,6 @@ def metric_case(log: MeasuredLog, seed: int, changes: tuple[str, ...], particles
     """The case with a single area, and a number of particles."""
     own = (f"local_map.extent={EXTENTS[log.name]:g}", f"filter.particles={particles}")
     return ChartedCase(log, seed, changes=(*changes, *own), variant=METRIC)
-
-
-class CachedRunner(Runner):
-    """A runner that keeps runs in their folder, for the same program and parameters."""
-
-    def _run(self, case: Case) -> Run:
-        folder = self.folder.absolute() / case.name
-        usage_file = folder / "usage.json"
-        if usage_file.is_file():
-            usage: dict[str, Any] = json.loads(usage_file.read_text(encoding="utf-8"))
-            if usage.pop("code") == _fingerprint():
-                return Run(case, folder, **usage)
-        shutil.rmtree(folder, ignore_errors=True)
-        run = super()._run(case)
-        if not run.fault:
-            usage = {"cpu_seconds": run.cpu_seconds, "wall_seconds": run.wall_seconds, "peak_rss": run.peak_rss}
-            usage_file.write_text(json.dumps(usage | {"code": _fingerprint()}), encoding="utf-8")
-        return run
 
 
 def _fingerprint() -> str:

@@ -68,7 +68,7 @@ def test_tables_are_written_between_their_marks_and_nowhere_else(tmp_path):
     assert other not in document.read_text()
 
 
-@pytest.mark.parametrize("kind", ["accuracy", "robustness", "sessions", "speed"])
+@pytest.mark.parametrize("kind", ["accuracy", "odometry", "robustness", "sessions", "speed"])
 def test_the_document_has_a_place_for_every_measurement(kind):
     text = ACCURACY.read_text()
     assert all(text.count(mark) == 1 for mark in document_marks(kind))

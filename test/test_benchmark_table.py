@@ -7,9 +7,8 @@ import pytest
 
 from benchmark.charted_run import OneArea
 from benchmark.logs import MeasuredLog
-from benchmark.runs import Run
+from benchmark.runs import CachedRunner, Run
 from benchmark.table import (
-    CachedRunner,
     Comparison,
     Entry,
     comparison_table,
@@ -69,12 +68,12 @@ def test_a_run_is_kept_and_made_again_for_another_program(tmp_path, monkeypatch)
     monkeypatch.setattr("benchmark.runs.run_case", run_case)
     case = metric_case(LOG, 0, (), 12)
     for _ in range(2):
-        (run,) = CachedRunner(tmp_path, 1).runs([case])
+        (run,) = CachedRunner(tmp_path, 1, "this").runs([case])
         assert (run.cpu_seconds, run.wall_seconds, run.peak_rss) == (5.0, 6.0, 7)
     assert len(runs) == 1
     usage = runs[0] / "usage.json"
     usage.write_text(json.dumps(json.loads(usage.read_text()) | {"code": "older"}))
-    CachedRunner(tmp_path, 1).runs([case])
+    CachedRunner(tmp_path, 1, "this").runs([case])
     assert len(runs) == 2
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from preloaded import hmt_slam
 from rosbags.rosbag2 import Reader
 from test_logs_convert import assert_same_log
 
@@ -213,8 +214,7 @@ def test_an_occupancy_image_becomes_walls_where_its_pixels_are_black(tmp_path, s
 
 
 def test_the_map_that_a_run_leaves_can_be_driven_through(tmp_path):
-    command = [sys.executable, "-m", "hmt_slam_ros.cli.main"]
-    subprocess.run([*command, "map", MALAGA, "--out", tmp_path / "out", "--duration", "10"], check=True, timeout=300)
+    hmt_slam("map", MALAGA, "--out", tmp_path / "out", "--duration", 10, check=True)
     path = read_tum(tmp_path / "out" / "trajectory.tum").poses
     world = yaml.safe_load((tmp_path / "out" / "map.yaml").read_text())
     # The robot stands for a while first, and millimeters of a route would turn it anywhere.
@@ -227,9 +227,8 @@ def test_the_map_that_a_run_leaves_can_be_driven_through(tmp_path):
 
 
 def test_simulate_writes_bag_and_truth_and_evaluate_takes_either(tmp_path):
-    command = [sys.executable, "-m", "hmt_slam_ros.cli.main"]
     words = ["simulate", "ring", "--seed", "3", "--set", "laps=1", "--duration", "20", "--out", tmp_path / "bag"]
-    sent = subprocess.run([*command, *words], capture_output=True, text=True, check=True, timeout=120).stdout
+    sent = hmt_slam(*words, check=True).stdout
     assert "101 scans, 20.0 s" in sent
     assert "sim:ring,laps=1,seed=3" in sent
     log = open_log("sim:ring,laps=1,seed=3", duration=20.0)
@@ -238,7 +237,4 @@ def test_simulate_writes_bag_and_truth_and_evaluate_takes_either(tmp_path):
     np.testing.assert_allclose(truth.poses, read_true_poses(open_log(tmp_path / "bag")).poses, atol=1e-8)
     (tmp_path / "trajectory.tum").write_text((tmp_path / "bag" / "ground_truth.tum").read_text())
     for source in (tmp_path / "bag", "sim:ring,laps=1,seed=3"):
-        table = subprocess.run(
-            [*command, "evaluate", tmp_path, "--truth", source], capture_output=True, text=True, check=True, timeout=120
-        ).stdout
-        assert "0.000 +- 0.000" in table
+        assert "0.000 +- 0.000" in hmt_slam("evaluate", tmp_path, "--truth", source, check=True).stdout

@@ -1,10 +1,8 @@
 """A simulated drive through the whole system, against the truth."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
+from preloaded import hmt_slam
 
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.evaluation import evaluate_relations, read_true_poses, read_tum, true_relations
@@ -16,15 +14,10 @@ from hmt_slam_ros.sensors.motion_model import MotionModel
 LOG = "sim:ring,seed=2,size=0.8"
 
 
-def hmt_slam(*arguments):
-    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
-
-
 @pytest.fixture(scope="module")
 def mapped_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "out"
-    messages = hmt_slam("map", LOG, "--out", folder)
+    messages = hmt_slam("map", LOG, "--out", folder, check=True).stdout
     return folder, messages
 
 
@@ -43,8 +36,8 @@ def test_a_small_loop_is_closed_and_mapped_to_two_centimeters(mapped_folder):
 
 def test_its_bag_makes_the_same_map_as_far_as_quaternions_are_exact(mapped_folder, tmp_path):
     folder, _ = mapped_folder
-    hmt_slam("simulate", "ring", "--seed", "2", "--set", "size=0.8", "--out", tmp_path / "bag")
-    hmt_slam("map", tmp_path / "bag", "--out", tmp_path / "out")
+    hmt_slam("simulate", "ring", "--seed", "2", "--set", "size=0.8", "--out", tmp_path / "bag", check=True)
+    hmt_slam("map", tmp_path / "bag", "--out", tmp_path / "out", check=True)
     found, expected = (np.loadtxt(out / "trajectory.tum") for out in (tmp_path / "out", folder))
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
 

@@ -30,12 +30,18 @@ _TAIL = 3  # lines of a failed run that go into a message
 
 
 @cache
-def code_hash() -> str:
-    """A hash of the program and its parameters, which identifies its records."""
+def code_hash(own: str = "benchmark/simulated", without: tuple[str, ...] = ()) -> str:
+    """A hash of the program and its parameters, which identifies its records.
+
+    :param own: folder of the program that makes the records.
+    :param without: packages of ``hmt_slam_ros`` that do not take part.
+    """
     digest = hashlib.sha256(PARAMETERS.read_bytes())
-    for folder in ("hmt_slam_ros", "benchmark/simulated"):
+    left_out = [ROOT / "hmt_slam_ros" / package for package in without]
+    for folder in ("hmt_slam_ros", own):
         for file in sorted((ROOT / folder).rglob("*.py")):
-            digest.update(file.read_bytes())
+            if not any(file.is_relative_to(package) for package in left_out):
+                digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
 
 

@@ -1,0 +1,1 @@
+"""Faults of real sensors, planted into recorded and simulated logs."""
