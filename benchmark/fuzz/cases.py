@@ -17,6 +17,9 @@ import yaml
 from rosbags.rosbag2 import Reader, Writer
 
 from benchmark.fuzz.mutations import Mutation, mutate_bytes, mutate_json, mutate_lines
+from benchmark.fuzz.node_loading import LOAD_IN_NODES
+from benchmark.fuzz.seeds import MAP_SEEDS
+from benchmark.fuzz.tampering import MAP, STATE, tamper_with_map
 from hmt_slam_ros.logs.ros_types import typestore
 from hmt_slam_ros.saved_map.folder import MANIFEST, _manifest_digest
 
@@ -33,7 +36,7 @@ class FuzzCase:
     :ivar name: of the case.
     :ivar seed: folder, a copy of which is mutated.
     :ivar mutate: what mutates the copy.
-    :ivar commands: arguments of ``hmt_slam``; ``{}`` stands for the copy.
+    :ivar commands: arguments of `node_loading.run_arguments`; ``{}`` stands for the copy.
     """
 
     name: str
@@ -227,12 +230,30 @@ def _log_commands(log: str) -> tuple[tuple[str, ...], ...]:
 
 def map_cases(seeds: Path) -> Iterator[FuzzCase]:
     """Saved maps: damaged, and tampered with behind right checksums."""
-    commands = (
-        ("map", "{}/bag", "--from", "{}/out", "--out", "{}/mapped"),
-        ("map", "{}/bag", "--from", "{}/out/hmt_map", "--mode", "localization", "--out", "{}/mapped"),
+    go_on = ("map", "{}/log.clf", "--from", "{}/out", "--out", "{}/mapped")
+    states = (
+        go_on,
+        (*go_on, "--mode", "lifelong"),
+        ("map", "{}/log.clf", "--from", "{}/out/hmt_map", "--mode", "localization", "--out", "{}/mapped"),
+        (LOAD_IN_NODES, "{}/out"),
+    )
+    maps = (
         ("export", "{}/out"),
         ("export", "{}/out", "--grid", "{}/grid"),
+        ("export", "{}/out", "--grid", "{}/grid", "--area", "0"),
         ("plot", "{}/out"),
+        ("evaluate", "{}/out", "--relations", "{}/relations", "--odometry", "{}/log.clf"),
+        (LOAD_IN_NODES, "{}/out"),
     )
-    yield FuzzCase("damaged map", seeds / "map", _damaged_map, commands)
-    yield FuzzCase("tampered map", seeds / "map", _saved_map, commands)
+    yield FuzzCase("damaged map", seeds / "map", _damaged_map, (*states, *maps))
+    for seed in MAP_SEEDS:
+        yield FuzzCase(f"mutated file, {seed}", seeds / seed, _saved_map, (*states, *maps))
+        yield FuzzCase(f"tampered state, {seed}", seeds / seed, _tampered_map(STATE), states)
+        yield FuzzCase(f"tampered map, {seed}", seeds / seed, _tampered_map(MAP), maps)
+
+
+def _tampered_map(documents: frozenset[str]) -> Prepare:
+    def prepare(folder: Path, rng: np.random.Generator) -> None:
+        tamper_with_map(folder / "out" / "hmt_map", rng, documents)
+
+    return prepare

@@ -134,7 +134,7 @@ def judge(status: int | None, text: str) -> Verdict:
     """The verdict on an exit status as of `os.wait`, None after a timeout, and on what was printed."""
     if status is None or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU):
         return Verdict.HANG
-    if "MemoryError" in text:
+    if "MemoryError" in text or "there is no memory left" in text:
         return Verdict.MEMORY
     if "Traceback (most recent call last)" in text:
         return Verdict.TRACEBACK

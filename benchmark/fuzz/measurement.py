@@ -15,6 +15,7 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,18 +24,18 @@ import numpy as np
 from benchmark.fuzz.cases import FuzzCase, map_cases, reader_cases, yaml_cases
 from benchmark.fuzz.crafted import GROUPS, crafted_cases, run_subprocess
 from benchmark.fuzz.guided import fuzz_guided
-from benchmark.fuzz.isolation import CommandAnswer, Verdict, run_command
-from benchmark.fuzz.seeds import write_seeds
+from benchmark.fuzz.isolation import CommandAnswer, Verdict, run_isolated
+from benchmark.fuzz.node_loading import run_arguments
+from benchmark.fuzz.seeds import write_map_seeds, write_seeds
 from benchmark.fuzz.targets import TARGETS
 from benchmark.report import Report, Requirement, table
 from benchmark.settings import Settings
-from hmt_slam_ros.cli.main import main
 from hmt_slam_ros.errors import HmtSlamError
 
 KINDS: dict[str, tuple[Callable[[Path], Iterable[FuzzCase]], int]] = {
     "readers": (reader_cases, 1400),
     "yaml": (yaml_cases, 100),
-    "maps": (map_cases, 471),
+    "maps": (map_cases, 1300),
 }
 """{kind: its cases below a folder of seeds, and the number of runs for each seed}."""
 
@@ -74,6 +75,8 @@ def measure_fuzz(settings: Settings) -> Report:
     folder = settings.out / "seeds"
     with _silence():
         write_seeds(folder)
+        if "maps" in chosen:
+            write_map_seeds(folder)
     if _GUIDED in chosen:
         _add_guided(report, settings)
     if _HOSTILE in chosen:
@@ -131,19 +134,23 @@ def mutated_runs(kind: str, seeds: Path, count: int, seed: int) -> Iterator[Fuzz
         with _copy(case.seed) as folder:
             case.mutate(folder, rng)
             arguments = case.arguments(folder, rng)
-            answer = run_command(arguments)
+            answer = run_isolated(partial(run_arguments, arguments))
         yield FuzzRun(kind, case.name, seed, number, " ".join(arguments).replace(str(folder), ""), answer)
 
 
 def warm_up(cases: Sequence[FuzzCase]) -> None:
-    """Run every command on its seed in this process, so that a fork of it has all modules and compiled functions.
+    """Run every command on its first seed, and the first of each seed, in this process.
+
+    A fork of it then has all modules and compiled functions.
 
     :raises HmtSlamError: where a command refuses the seed.
     """
-    commands = {(case.seed, command) for case in cases for command in case.commands}
+    first_seeds = {command: case.seed for case in reversed(cases) for command in case.commands}
+    commands = {(case.seed, case.commands[0]) for case in cases}
+    commands |= {(seed, command) for command, seed in first_seeds.items()}
     for seed, command in sorted(commands):
         with _copy(seed) as folder, _silence():
-            status = main([word.replace("{}", str(folder)) for word in command])
+            status = run_arguments([word.replace("{}", str(folder)) for word in command])
         if status not in (0, 1):
             raise HmtSlamError(f"hmt_slam {' '.join(command)} refuses the seed {seed}: mend the seed")
     gc.freeze()  # what a fork does not touch, it need not copy

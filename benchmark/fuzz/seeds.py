@@ -13,6 +13,7 @@ from hmt_slam_ros.sensors import Odometry
 
 _BUNDLED = ROOT / "data" / "malaga_one_loop"
 _SECONDS = "8"
+_TWINS = Path("sim:twins,seed=2")
 
 _WORLD = """\
 walls: [[0, 0, 8, 0], [8, 0, 8, 6], [8, 6, 0, 6], [0, 6, 0, 0]]
@@ -46,11 +47,43 @@ def write_seeds(folder: Path) -> None:
     (target / "relations").write_text(_RELATIONS)
 
 
-def carmen_text(log: Path) -> str:
-    """A log's first seconds as ODOM and FLASER lines."""
+MAP_SEEDS = ("map", "loop", "lines", "twins", "lost", "lost lines")
+"""Folders with a map in ``out`` and a log, from the smallest map to those of a robot that is lost."""
+
+_TWO_PARTICLES = ("--set", "filter.particles=2")
+
+
+def write_map_seeds(folder: Path) -> None:
+    """Make the seeds with larger maps, below a folder of seeds; ``log.clf`` goes on from each.
+
+    They have several areas and hypotheses, loop closures, landmarks, maps of lines, and a lost robot.
+
+    :raises HmtSlamError: where one cannot be made.
+    """
+    twins = folder / "logs" / "twins.clf"
+    twins.write_text(carmen_text(_TWINS, 0.0, 58.0), encoding="ascii")
+    logs = {name: folder / name / "log.clf" for name in MAP_SEEDS}
+    for name, log in logs.items():
+        log.parent.mkdir(exist_ok=True)
+        text = carmen_text(_TWINS, 58.0, 2.0) if name == "twins" else carmen_text(_BUNDLED, 25.0, 2.0)
+        log.write_text(text, encoding="ascii")
+        (log.parent / "relations").write_text(_RELATIONS)
+    for name, source, settings in (
+        ("loop", _BUNDLED, _TWO_PARTICLES),
+        ("lines", _BUNDLED, ("--set", "local_map.kind=lines")),
+        ("twins", twins, (*_TWO_PARTICLES, "--set", "aam.area_policy=both")),
+    ):
+        _run("map", str(source), "--out", str(folder / name / "out"), *settings, "--duration", "52")
+    for name, before, mode in (("lost", "loop", "lifelong"), ("lost lines", "lines", "mapping")):
+        further = ("--from", str(folder / before / "out"), "--mode", mode, "--duration", "1")
+        _run("map", str(logs[name]), "--out", str(folder / name / "out"), *further)
+
+
+def carmen_text(log: Path, start: float = 0.0, duration: float = 4.0) -> str:
+    """Some seconds of a log as ODOM and FLASER lines, with every fourth beam."""
     lines = ["PARAM robot_frontlaser_offset 0.1 ipc 0 host 0\n"]
     pose = "0 0 0"
-    for record in open_log(log, duration=4.0).records():
+    for record in open_log(log, start=start, duration=duration).records():
         stamp = seconds_from_stamp(record.source_stamp)
         if isinstance(record.measurement, Odometry):
             pose = " ".join(f"{value:.6f}" for value in record.measurement.pose)

@@ -15,7 +15,10 @@ from benchmark.report import Report, Requirement, table
 from benchmark.settings import Settings
 from hmt_slam_ros.errors import HmtSlamError
 
-OPERATIONS = ("file", "folder", "journal", "convert to mcap", "convert to sqlite3", "plot", "export", "map")
+OPERATIONS = (
+    "file", "folder", "journal", "convert to mcap", "convert to sqlite3", "plot", "export", "map", "save",
+    "save while localized",
+)  # fmt: skip
 """Names of `operations.operations`, which loads all that they need."""
 
 

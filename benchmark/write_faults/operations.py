@@ -8,18 +8,24 @@ import json
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from PIL import Image
 
 from benchmark.fuzz.cases import SHORT
+from hmt_slam_ros.cli import run_commands
 from hmt_slam_ros.cli.main import main
+from hmt_slam_ros.cli.run_commands import run_measured
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs import Log
 from hmt_slam_ros.own_files import write_file
+from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.results.output_folder import atomic_output
 from hmt_slam_ros.saved_map.folder import FORMAT, HMT_MAP, VERSION, FolderReader, FolderWriter
 from hmt_slam_ros.sensors import Odometry
@@ -37,6 +43,7 @@ class Operation:
     :ivar act: the operation in that folder; returns an exit status as ``hmt_slam`` does.
     :ivar is_whole: whether all files are old, or all are new.
     :ivar verify: raises an exception where the folder cannot be read.
+    :ivar foreign: files beside, which others wrote.
     """
 
     name: str
@@ -44,6 +51,7 @@ class Operation:
     act: Callable[[Path], int]
     is_whole: bool = True
     verify: Callable[[Path], None] = lambda _: None
+    foreign: tuple[str, ...] = ()
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -89,7 +97,10 @@ def operations(seeds: Path) -> dict[str, Operation]:
 
     :param seeds: folder of the seeds of the fuzzer.
     """
+    from benchmark.write_faults import node_save  # noqa: PLC0415  rclpy is only for nodes
+
     bag, out = seeds / "map" / "bag", seeds / "map" / "out"
+    run, log = out / HMT_MAP, seeds / "logs" / "log.clf"
 
     def copy_results(folder: Path) -> None:
         shutil.copytree(out, folder / "out")
@@ -99,10 +110,20 @@ def operations(seeds: Path) -> dict[str, Operation]:
             (folder / "out" / name).unlink(missing_ok=True)
 
     def command(*words: str) -> Callable[[Path], int]:
-        return lambda folder: main([word.format(folder=folder, bag=bag) for word in words])
+        return lambda folder: main([word.format(folder=folder, bag=bag, log=log) for word in words])
 
     def nothing(_folder: Path) -> None:
         pass
+
+    run_once = _RunOnce()
+
+    def map_again(folder: Path) -> int:
+        with patch.object(run_commands, "run_measured", run_once):
+            return command("map", "{log}", "--out", "{folder}/out", *SHORT)(folder)
+
+    def prepare_localized(folder: Path) -> None:
+        node_save.prepare(folder, run)
+        node_save.save(run)(folder)
 
     every = (
         Operation("file", _write_old_file, _write_new_file),
@@ -116,9 +137,40 @@ def operations(seeds: Path) -> dict[str, Operation]:
         ),
         Operation("plot", copy_results, command("plot", "{folder}/out"), is_whole=False, verify=_read_map),
         Operation("export", copy_results, command("export", "{folder}/out"), is_whole=False, verify=_read_map),
-        Operation("map", copy_results, command("map", "{bag}", "--out", "{folder}/out", *SHORT), verify=_read_map),
+        Operation("map", copy_results, map_again, verify=_read_map),
+        Operation(
+            "save",
+            partial(node_save.prepare, old=run),
+            node_save.save(run),
+            verify=node_save.verify,
+            foreign=node_save.FOREIGN,
+        ),
+        Operation(
+            "save while localized",
+            prepare_localized,
+            node_save.save(run, run),
+            verify=node_save.verify,
+            foreign=node_save.FOREIGN,
+        ),
     )
     return {operation.name: operation for operation in every}
+
+
+class _RunOnce:
+    """``run_measured`` for many trials that differ in their writes alone: the run is computed at the first call."""
+
+    def __init__(self) -> None:
+        self._result: Any = None
+        self._states: list[RunState] = []
+
+    def __call__(
+        self, log: Log, configuration: Configuration, state: RunState, on_state: Callable[[RunState], None]
+    ) -> Any:  # noqa: ANN401  what run_measured returns
+        if self._result is None:
+            self._result = run_measured(log, configuration, state, self._states.append)
+        for last in self._states:
+            on_state(last)
+        return self._result
 
 
 def _write_old_file(folder: Path) -> None:

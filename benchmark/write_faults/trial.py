@@ -7,6 +7,7 @@ import ctypes
 import errno
 import json
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -20,7 +21,8 @@ from hmt_slam_ros.cli.main import FAULT
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.untrusted_input import one_sentence
 
-_KILLED = 137
+_PROCESS = re.compile(r"(?<=\.partial-)[0-9]+(-\w+)?")
+"""Process id, and what makes the name of a scratch folder unique."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ FAULTS = (
     Fault("killed after", 3),
     Fault("killed before, no exchange", 2, exchange=False),
     Fault("killed after, no exchange", 3, exchange=False),
+    Fault("faulty disk, no exchange", 0, errno.EIO, exchange=False),
 )
 
 
@@ -100,6 +103,7 @@ def try_operation(operation: Operation, faults: tuple[Fault, ...], every: int, w
     start.mkdir()
     operation.prepare(start)
     old = digests(start)
+    judged: dict[tuple[str, ...], str] = {}
     for fault in faults:
         folder = _fresh(start, work)
         answer = _run(operation, folder, 0, fault, count)
@@ -112,9 +116,11 @@ def try_operation(operation: Operation, faults: tuple[Fault, ...], every: int, w
                 folder = _fresh(start, work)
                 answer = _run(operation, folder, call, fault, count)
                 yield call
-                text = _judge(operation, folder, fault, answer, (old, new)) or _judge_next(
-                    operation, folder, count, new
-                )
+                text = _judge(operation, folder, fault, answer, (old, new))
+                found = _state_left_behind(folder)
+                if not text and found not in judged:
+                    judged[found] = _judge_next(operation, folder, count, new)
+                text = text or judged.get(found, "")
                 if text:
                     yield Breach(operation.name, fault.name, call, text)
 
@@ -143,8 +149,13 @@ def _judge(
         return _verification(operation, folder)
     if answer.verdict is Verdict.ACCEPTED:
         old = new
-    if answer.verdict is Verdict.REFUSED and fault.kind == 0 and fault.error != errno.EROFS and _leftovers(folder):
-        return f"refused, and left {_leftovers(folder)}"
+    if (
+        answer.verdict is Verdict.REFUSED
+        and fault.kind == 0
+        and fault.error != errno.EROFS
+        and _leftovers(operation, folder)
+    ):
+        return f"refused, and left {_leftovers(operation, folder)}"
     if not fault.exchange and not (folder / "out").exists() and any(folder.glob(".out.partial-*/old")):
         return ""  # for a moment there is none; the next run puts it back
     return complaint(folder, old, new, is_whole=operation.is_whole) or (_verification(operation, folder) if old else "")
@@ -158,8 +169,20 @@ def _verification(operation: Operation, folder: Path) -> str:
     return ""
 
 
-def _leftovers(folder: Path) -> list[str]:
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if "partial" in path.name)
+def _leftovers(operation: Operation, folder: Path) -> list[str]:
+    own = {name for path in operation.foreign for name in (path, str(Path(path).parent))}
+    names = {str(path.relative_to(folder)) for path in folder.rglob("*") if "partial" in path.name}
+    return sorted(names - own)
+
+
+def _state_left_behind(folder: Path) -> tuple[str, ...]:
+    """What the next run finds: digests of all files, but of those under way the names alone, without process ids."""
+    hidden = (
+        f"{_PROCESS.sub('', str(path.relative_to(folder)))} {path.is_dir() or path.stat().st_size > 0}"
+        for path in folder.rglob("*")
+        if ".partial-" in str(path.relative_to(folder))
+    )
+    return (*(f"{name} {digest}" for name, digest in digests(folder).items()), *sorted(hidden))
 
 
 def _judge_next(operation: Operation, folder: Path, count: Path, new: dict[str, str]) -> str:
@@ -169,8 +192,8 @@ def _judge_next(operation: Operation, folder: Path, count: Path, new: dict[str, 
     answer = _run(operation, folder, 0, FAULTS[0], count)
     if answer.verdict is not (Verdict.REFUSED if is_refused else Verdict.ACCEPTED):
         return f"the next run says {answer.text[-500:]}"
-    if _leftovers(folder):
-        return f"the next run leaves {_leftovers(folder)}"
+    if _leftovers(operation, folder):
+        return f"the next run leaves {_leftovers(operation, folder)}"
     if operation.name == "journal":
         return _verification(operation, folder)
     return complaint(folder, new, new, is_whole=True)
