@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,7 +39,17 @@ myst_dmath_allow_digits = False
 HAS_API = find_spec("autoapi") is not None
 if HAS_API:
     from astroid.brain import brain_numpy_ndarray
+    from astroid.manager import AstroidManager
 
+    class OtherPackages(set[str]):
+        """Names of the modules that are neither of the package nor of Python."""
+
+        def __contains__(self, module: object) -> bool:
+            """Whether a module is of another package."""
+            return str(module).partition(".")[0] not in {PACKAGE, *sys.stdlib_module_names}
+
+    # The sources of numpy and rclpy are not parsed: the pages name what comes from there, and know nothing of it.
+    AstroidManager.brain["module_denylist"] = OtherPackages()
     extensions += ["sphinx.ext.autodoc", "autoapi.extension"]
     # astroid parses its text of the class ndarray at every annotation that names it, for half of the build's time.
     brain_numpy_ndarray.extract_node = cache(brain_numpy_ndarray.extract_node)

@@ -7,9 +7,10 @@ import sys
 import time
 
 import hypothesis
+import preloaded
 import pytest
 
-from hmt_slam_ros.process_table import node_command
+from hmt_slam_ros.process_table import RUN_NODE, node_command
 
 # The same examples at every run, however long one takes where the machine is busy.
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
@@ -22,9 +23,13 @@ os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 WAIT = 120.0  # s, for what normally takes less than one; a machine may be busy
-NODES = ("test_ros_", "test_view_page", "test_package_compilation")  # files in which nodes run
+# Files in which nodes run.
+NODES = ("test_ros_", "test_view_page", "test_package_compilation", "test_process_table", "test_benchmark_live")
 # Files that take longest begin first, so that no worker is left alone with one.
-LONG = ("test_docs_site", "test_offline_going_on", "test_whole_run", "test_benchmark_policies", "test_exploration.py")
+LONG = (
+    *("test_docs_site", "test_exploration.py", "test_offline_", "test_write_faults", "test_benchmark_", "test_fuzzing"),
+    *("test_ros_replay", "test_ros_hostile", "test_ros_faults", "test_ros_localization", "test_ros_saving"),
+)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -58,6 +63,27 @@ def domain(monkeypatch):
         monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         yield number
+
+
+@pytest.fixture(scope="session")
+def corridor(tmp_path_factory):
+    """The log of the drive along the corridor, and the folder of its map by the command line; nothing changes them."""
+    from logs_for_nodes import MAPPED_SCANS, corridor_bag  # noqa: PLC0415  only where it is needed
+
+    folder = tmp_path_factory.mktemp("corridor")
+    log = corridor_bag(folder, scans=MAPPED_SCANS)
+    preloaded.hmt_slam("map", log, "--out", folder / "out", check=True)
+    return log, folder / "out"
+
+
+@pytest.fixture(scope="session")
+def fuzz_seeds(tmp_path_factory):
+    """The folder of the valid files that the fuzzer changes; they stay as they are."""
+    from benchmark.fuzz.seeds import write_seeds  # noqa: PLC0415  only where it is needed
+
+    folder = tmp_path_factory.mktemp("fuzz") / "seeds"
+    write_seeds(folder)
+    return folder
 
 
 class Listener:
@@ -123,19 +149,19 @@ def listener(domain):
 def start(domain):
     """Starts nodes as OS processes, behind words such as of a command that runs them elsewhere.
 
+    Their libraries are loaded before, unless that is not wanted, or other words come before.
     At the end, each that is left has to end well on request.
     """
     started = []
 
-    def start(name, *arguments, before=(), **parameters):
+    def start(name, *arguments, before=(), preload=True, **parameters):
         words = [word for key, value in parameters.items() for word in ("-p", f"{key.replace('__', '.')}:={value}")]
-        process = subprocess.Popen(
-            [*before, sys.executable, *node_command(name), "--ros-args", *words, *arguments],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=dict(os.environ),
-        )
+        outputs = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        if preload and not before:
+            process = preloaded.start(RUN_NODE, name, "--ros-args", *words, *arguments, **outputs)
+        else:
+            command = [*before, sys.executable, *node_command(name), "--ros-args", *words, *arguments]
+            process = subprocess.Popen(command, **outputs)
         started.append(process)
         return process
 

@@ -1,8 +1,9 @@
 """A hostile participant: it speaks on every topic and calls every service that it finds, with what cannot be right.
 
-Run as ``python hostile.py RESULT.json``, in the domain of running nodes. Topics, types and services come from the ROS
-graph, documents from what the nodes send themselves, so that it covers a new topic without a change. It does not send
-what nobody can tell from the truth: a plausible scan between two others, or a valid command such as ``slam/reset``.
+Run as ``python hostile.py RESULT.json``, in the domain of running nodes. It makes RESULT.ready when it has found them,
+and begins when that file is removed. Topics, types and services come from the ROS graph, documents from what the nodes
+send themselves, so that it covers a new topic without a change. It does not send what nobody can tell from the truth: a
+plausible scan between two others, or a valid command such as ``slam/reset``.
 """
 
 import json
@@ -15,6 +16,7 @@ from collections import Counter
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
+from itertools import chain, repeat, zip_longest
 from pathlib import Path
 
 # It does not check its fields.
@@ -62,6 +64,8 @@ LONG_PAUSE = 0.25
 """The same after a message of which the page takes the newest alone, five times a second, s."""
 NEWEST_ALONE = ("/map", "/pose", "/hmt/graph")
 ANSWER_TIMEOUT = 60.0  # s
+ATTACK_RATE = 0.2
+"""Rate of the robot while it speaks, so that its log lasts as long."""
 BEAMS = 91
 
 
@@ -113,42 +117,44 @@ def scan(stamp, frame="laser", count=BEAMS, **fields):
 
 
 def bad_scans(newest):
-    """Scans that can be refused, the newest of the robot's having a stamp, ns."""
-    due = newest + SECOND // 20
+    """Scans that can be refused; ``newest()`` is the stamp of the robot's last one, ns."""
+    due = lambda: newest() + SECOND // 20  # noqa: E731
     for fields in (
         {"angle_min": NAN}, {"angle_min": INFINITY}, {"angle_increment": 1e-30}, {"angle_increment": 0.0},
         {"angle_increment": NAN}, {"angle_increment": INFINITY}, {"angle_increment": HUGE}, {"range_max": NAN},
         {"range_min": INFINITY, "range_max": INFINITY}, {"range_min": -1.0}, {"range_min": NAN},
         {"range_max": -INFINITY}, {"time_increment": NAN}, {"time_increment": -1.0}, {"time_increment": 1e9},
     ):  # fmt: skip
-        yield scan(due, **fields)
-        yield scan(due, intensities=array("f", [1.0] * 3), **fields)
-    yield scan(due, count=1_000_000)
+        yield scan(due(), **fields)
+        yield scan(due(), intensities=array("f", [1.0] * 3), **fields)
+    yield scan(due(), count=1_000_000)
     for frame in ("", "x" * 5000, "nobody's", "line\nbreak"):
-        yield scan(due, frame)
-    for stamp in (0, newest - 3600 * SECOND, newest - 2 * SECOND, newest, newest + 3600 * SECOND, (2**31 - 1) * SECOND):
-        yield scan(stamp)
+        yield scan(due(), frame)
+    yield scan(0)
+    yield from (scan(newest() + late * SECOND) for late in (-3600, -2, 0, 3600))
+    yield scan((2**31 - 1) * SECOND)
     # Two that confirm each other.
-    yield from (scan(newest + 7200 * SECOND + k * SECOND // 5) for k in range(4))
-    before = scan(due)
+    yield from (scan(newest() + 7200 * SECOND + k * SECOND // 5) for k in range(4))
+    before = scan(due())
     before.header.stamp.sec = -5
     yield before
 
 
 def bad_readings(newest):
-    """Odometry that can be refused."""
+    """Odometry that can be refused; ``newest()`` is the stamp of the robot's last scan, ns."""
     for part in ("x", "y", "z"):
         for value in FLOATS if part != "z" else ():
-            message = reading(newest + SECOND // 20)
+            message = reading(newest() + SECOND // 20)
             setattr(message.pose.pose.position, part, value)
             yield message
     for w in (0.0, NAN, INFINITY, 2.0, 1e-3, DENORMAL):
-        message = reading(newest + SECOND // 20)
+        message = reading(newest() + SECOND // 20)
         message.pose.pose.orientation.w = w
         yield message
-    for stamp in (0, newest - 3600 * SECOND, newest, newest + 3600 * SECOND, (2**31 - 1) * SECOND):
-        yield reading(stamp)
-    yield from (reading(newest + 7200 * SECOND + k * SECOND // 20) for k in range(4))
+    yield reading(0)
+    yield from (reading(newest() + late * SECOND) for late in (-3600, 0, 3600))
+    yield reading((2**31 - 1) * SECOND)
+    yield from (reading(newest() + 7200 * SECOND + k * SECOND // 20) for k in range(4))
 
 
 def reading(stamp):
@@ -232,33 +238,30 @@ def broken_documents(document):
 
 
 def wrong_hypotheses(sequence, system):
-    """Documents of hypotheses that make no sense at the next keyframe event, or are far from it."""
+    """Documents of hypotheses that make no sense at the next keyframe event, or are far from it.
+
+    :param sequence: returns the number of the last keyframe event.
+    """
 
     def alone(identity=0, parent=0, probability=1.0):
         return (Hypothesis(identity, parent, probability, 0),)
 
-    for event in (sequence, sequence + 1):
+    for ahead in (0, 1):
         for hypotheses in ((), alone(7, 99), alone() + alone(), alone(probability=7.0), alone(probability=-1.0)):
-            yield encode(Hypotheses(event, hypotheses), 0, system)
-    for event in (0, sequence + 50, 10**6, 10**18):
-        yield encode(Hypotheses(event, alone()), 0, system)
+            yield encode(Hypotheses(sequence() + ahead, hypotheses), 0, system)
+    yield from (encode(Hypotheses(event, alone()), 0, system) for event in (0, 10**6, 10**18))
+    yield encode(Hypotheses(sequence() + 50, alone()), 0, system)
     for reset_number in (5, 2**62):
-        yield encode(Hypotheses(sequence + 1, alone()), reset_number, system)
-    yield encode(Hypotheses(sequence + 1, alone()), 0, "another")
-    yield encode(Hypotheses(sequence + 1, alone()), 0, "")
+        yield encode(Hypotheses(sequence() + 1, alone()), reset_number, system)
+    yield encode(Hypotheses(sequence() + 1, alone()), 0, "another")
+    yield encode(Hypotheses(sequence() + 1, alone()), 0, "")
 
 
-def keyframe_scans(stamp, system):
-    """Scans of keyframes that are none."""
-    for frame in (
-        "keyframe_1",
-        keyframe_frame(10**6, 0, system),
-        keyframe_frame(1, 0, "another"),
-        "keyframe_x",
-        "x" * 5000,
-    ):
-        yield scan(stamp, frame)
-    yield scan(stamp, keyframe_frame(0, 0, system), ranges=array("f"))
+def keyframe_scans(newest, system):
+    """Scans of keyframes that are none; ``newest()`` is the stamp of the robot's last scan, ns."""
+    strange = (keyframe_frame(10**6, 0, system), keyframe_frame(1, 0, "another"))
+    yield from (scan(newest(), frame) for frame in ("keyframe_1", *strange, "keyframe_x", "x" * 5000))
+    yield scan(newest(), keyframe_frame(0, 0, system), ranges=array("f"))
 
 
 class Stranger:
@@ -270,7 +273,7 @@ class Stranger:
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
         self.publishers, self.sent, self.called = {}, Counter(), Counter()
-        self.documents, self.broken, self.newest, self.slowest = {}, {}, 0, 0.0
+        self.documents, self.newest, self.slowest = {}, 0, 0.0
         self.texts = set()
         self.counts, self.sentences, self.unanswered = {}, set(), []
         self.node.create_subscription(LaserScan, "scan", self._on_scan, topics.SENSOR)
@@ -308,54 +311,62 @@ class Stranger:
                 found[topic] = getattr(import_module(f"{package}.msg"), name)
         return found
 
-    def publish(self, topic, kind, message, profile=PROFILE):
-        if topic not in self.publishers:
-            self.publishers[topic] = self.node.create_publisher(kind, topic, profile)
-            self.spin(0.3)
-        if kind is String:
+    def publish(self, topic, message):
+        if isinstance(message, String):
             self.texts.add(message.data)
         self.publishers[topic].publish(message)
         self.sent[topic] += 1
-        self.spin(LONG_PAUSE if topic in NEWEST_ALONE else PAUSE)
 
     def speak(self):
-        """Send messages on all topics."""
-        for topic, kind in sorted(self.topics().items()):
+        """Send messages on all topics: between two on those of which the page takes the newest, all others."""
+        found = sorted(self.topics().items())
+        for topic, kind in found:
             # A publisher that offers less than the nodes ask for.
             self.node.create_publisher(kind, topic, topics.LIVE_SENSOR)
-            make = self.messages_for(topic, kind)
-            for k in range(len(make())):
-                # Of the state of the nodes at that moment.
-                self.publish(topic, kind, make()[k])
+            self.publishers[topic] = self.node.create_publisher(kind, topic, PROFILE)
+        self.spin(1.0)
+        # Of the state of the nodes when each is made.
+        messages = {topic: self.messages_for(topic, kind) for topic, kind in found}
+        seldom = zip_longest(*([(topic, one) for one in messages.pop(topic, ())] for topic in NEWEST_ALONE))
+        others = ((topic, one) for topic, several in messages.items() for one in several)
+        pause_end = 0.0
+        for turn in chain(others, repeat(None)):
+            if time.monotonic() >= pause_end:
+                pause_end = time.monotonic() + LONG_PAUSE
+                newest = next(seldom, None)
+                for one in filter(None, newest or ()):
+                    self.publish(*one)
+                if turn is None and newest is None:
+                    return
+            if turn is not None:
+                self.publish(*turn)
+            self.spin(PAUSE)
 
     def messages_for(self, topic, kind):
-        """A function that makes the messages for a topic."""
+        """The messages for a topic."""
         known = {
-            "/scan": lambda: list(bad_scans(self.newest)),
-            "/odom": lambda: list(bad_readings(self.newest)),
-            DIAGNOSTICS: lambda: list(diagnostics(self.system)),
-            "/hmt/graph": lambda: [MarkerArray(markers=[marker]) for marker in extreme_messages(Marker)],
-            "/initialpose": lambda: list(initial_poses()),
-            "/hmt/keyframe_scans": lambda: list(keyframe_scans(self.newest, self.system)),
+            "/scan": lambda: bad_scans(lambda: self.newest),
+            "/odom": lambda: bad_readings(lambda: self.newest),
+            DIAGNOSTICS: lambda: diagnostics(self.system),
+            "/hmt/graph": lambda: (MarkerArray(markers=[marker]) for marker in extreme_messages(Marker)),
+            "/initialpose": initial_poses,
+            "/hmt/keyframe_scans": lambda: keyframe_scans(lambda: self.newest, self.system),
         }
         if topic in known:
-            return known[topic]
+            return known[topic]()
         if kind is TFMessage:
-            return lambda: [TFMessage(transforms=joints) for joints in transforms()]
+            return (TFMessage(transforms=joints) for joints in transforms())
         if kind is String:
-            return lambda: [String(data=text) for text in self.texts_for(topic[1:])]
-        return lambda: list(extreme_messages(kind))
+            return (String(data=text) for text in self.texts_for(topic[1:]))
+        return extreme_messages(kind)
 
     def texts_for(self, topic):
         """Texts for a topic of documents or tasks."""
         yield from broken_texts()
-        if topic in self.broken:
-            yield from self.broken[topic]
-        elif topic in self.documents:
-            self.broken[topic] = list(broken_documents(self.documents[topic]))
-            yield from self.broken[topic]
+        if topic in self.documents:
+            yield from broken_documents(self.documents[topic])
         if topic == DOCUMENTS[Hypotheses]:
-            yield from wrong_hypotheses(json.loads(self.documents[topic])["sequence"], self.system)
+            yield from wrong_hypotheses(lambda: json.loads(self.documents[topic])["sequence"], self.system)
 
     @property
     def system(self):
@@ -378,6 +389,12 @@ class Stranger:
             self.unanswered.append(name)
         self.node.destroy_client(client)
         return future.result() if future.done() else None
+
+    def set_rate(self, rate):
+        """Set how fast the robot plays its log; 0 for as fast as the nodes answer."""
+        value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=rate)
+        request = SetParameters.Request(parameters=[Parameter(name="robot.rate", value=value)])
+        self.call(SetParameters, "/robot/set_parameters", request)
 
     def services(self):
         """{service: type} of the nodes."""
@@ -454,13 +471,17 @@ def main(result):
     stranger.spin(1.0)  # for their topics and services
     folder = result.parent / "hostile"
     folder.mkdir()
+    stranger.set_rate(ATTACK_RATE)
+    ready = result.with_suffix(".ready")
+    ready.touch()
+    while ready.exists():
+        stranger.spin(0.1)
     begin = time.monotonic()
     stranger.request(folder)
     stranger.speak()
     seconds = time.monotonic() - begin
     stranger.spin(3.0)
-    rate = Parameter(name="robot.rate", value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=0.0))
-    stranger.call(SetParameters, "/robot/set_parameters", SetParameters.Request(parameters=[rate]))
+    stranger.set_rate(0.0)
     report = {
         "sent": stranger.sent, "called": stranger.called, "slowest": stranger.slowest, "seconds": seconds,
         "counts": stranger.counts, "sentences": sorted(stranger.sentences), "unanswered": stranger.unanswered,

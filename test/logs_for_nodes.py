@@ -15,6 +15,8 @@ START = 1_700_000_000 * SECOND
 LASER = np.array([0.1, 0.0, 0.05])
 PACE = np.array([0.025, 0.0, 0.002])
 BEAMS = 91
+MAPPED_SCANS = 120
+"""Scans of the drive that the fixture ``corridor`` maps."""
 WALLS = np.concatenate([box(-3, -3, 12, 3), box(4, 1, 5, 3)])
 
 

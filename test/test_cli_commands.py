@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from preloaded import hmt_slam
 
 from hmt_slam_ros import __version__
 from hmt_slam_ros.configuration import Configuration, as_nested, load_configuration
@@ -18,11 +19,6 @@ ROOT = Path(__file__).resolve().parents[1]
 BAG = ROOT / "data" / "malaga_one_loop"
 COMMANDS = ("map", "replay", "convert", "simulate", "evaluate", "plot", "export", "parameters")
 SCAN_LINE = "FLASER 3 1.0 1.1 1.2 {x} 0 0 {x} 0 0 {t} robot {t}\n"
-
-
-def hmt_slam(*arguments: object, timeout: float = 120.0) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout, check=False)
 
 
 def error_line(result: subprocess.CompletedProcess) -> str:
@@ -44,14 +40,14 @@ def carmen(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_help_is_there_for_every_command_and_comes_at_once(command: str) -> None:
-    fastest = float("inf")
-    for _ in range(3):
-        begin = time.monotonic()
-        result = hmt_slam(*command.split(), "--help")
-        fastest = min(fastest, time.monotonic() - begin)
-        assert (result.returncode, result.stderr) == (0, "")
-        assert "usage: hmt_slam" in result.stdout
-    assert fastest < 1.0, "something heavy is imported for --help"
+    words = [sys.executable, "-m", "hmt_slam_ros.cli.main", *command.split(), "--help"]
+    before = os.times()
+    result = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    after = os.times()
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "usage: hmt_slam" in result.stdout
+    used = after.children_user + after.children_system - before.children_user - before.children_system
+    assert used < 1.0, "something heavy is imported for --help"
 
 
 def test_help_imports_nothing_heavy() -> None:

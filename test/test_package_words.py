@@ -54,7 +54,7 @@ RETIRED = re.compile(
 RETIRED_NAMES = {"told", "said", "asked", "heard", "leaf", "leaves", "news", "whereabouts", "errand", "errands"}
 RETIRED_NAMES |= {"astray", "doubts", "spots"}
 
-DOCTOR = ("beams", "finding", "odometry", "running", "timing")
+DOCTOR = ("beams", "finding", "odometry", "readings", "running", "timing")
 
 ALLOWED_PROSE = {
     "benchmark/awakening.py": {"awakening"},  # Robot awakening [B], the kind of the measurement

@@ -1,63 +1,26 @@
 """A process is one row of the table: a sixth one takes part in both runtimes, and all others expect it."""
 
 import json
-import os
 import socket
 import subprocess
 import sys
 from collections import defaultdict
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
+import sixth_process
+from sixth_process import NAME, CounterState
 
-from hmt_slam_ros import process_table
-from hmt_slam_ros.process_table import ProcessRow, node_command, process_names, topic_of
+from hmt_slam_ros.process_table import RUN_NODE, node_command, process_names, topic_of
 
-NAME = "counter"
 WORLD, SECONDS = "sim:office,size=0.7,rate=2.5", 30.0
-
-
-@dataclass(frozen=True)
-class CounterState:
-    """Number of closure decisions so far."""
-
-    decisions: int = 0
-
-
-class Counter:
-    """A process that counts closure decisions, and says so."""
-
-    def __init__(self, _configuration, state=None):
-        self.state = state or CounterState()
-
-    def handle(self, _message):
-        from hmt_slam_ros.messages.messages import Notice  # noqa: PLC0415  when the row is in the table
-
-        self.state = CounterState(self.state.decisions + 1)
-        return [Notice(NAME, f"decisions: {self.state.decisions}")]
-
-
-ROW = ProcessRow(
-    name=NAME,
-    title="counts closure decisions",
-    consumes=("ClosureDecision",),
-    factory="test_process_table:Counter",
-    state="test_process_table:CounterState",
-)
-
-
-def add_row():
-    process_table.PROCESSES = (*process_table.PROCESSES, ROW)
 
 
 @pytest.fixture
 def with_row(tmp_path, monkeypatch):
     """All Python programs that are started from here on have the row in the table from the beginning."""
-    (tmp_path / "sitecustomize.py").write_text("import test_process_table\ntest_process_table.add_row()\n")
-    folders = [str(tmp_path), str(Path(__file__).parent), *sys.path]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(folders))
+    sixth_process.add_to_programs(tmp_path, monkeypatch)
 
 
 def run_with_row(function, *arguments):
@@ -142,5 +105,5 @@ def test_a_node_of_it_answers_and_saves_its_part(with_row, listener, start, tmp_
 
 
 def test_every_node_is_started_by_its_name():
-    assert node_command(NAME) == ["-m", process_table.RUN_NODE, NAME]
+    assert node_command(NAME) == ["-m", RUN_NODE, NAME]
     assert NAME not in process_names()

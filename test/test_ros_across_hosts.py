@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from logs_for_nodes import corridor_bag
 from lossy_link import LossyLink, reason_against
+from preloaded import hmt_slam
 
 from hmt_slam_ros.process_table import process_names
 
@@ -29,8 +30,7 @@ def link(domain, monkeypatch):
 
 def test_the_map_is_that_of_one_host(link, domain, start, tmp_path):
     log, out, saved = corridor_bag(tmp_path, scans=SCANS), tmp_path / "out", tmp_path / "saved"
-    alone = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(out)]
-    subprocess.run(alone, check=True, timeout=120)
+    hmt_slam("map", log, "--out", out, check=True)
     listen = [
         *link.host_command(1),
         sys.executable,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import Listener
 from logs_for_nodes import BEAMS, LASER, PACE, SECOND, START, Corridor, corridor_bag
-from test_ros_localization import NODES, SCANS, Nodes, assert_true, mapped_corridor
+from test_ros_localization import NODES, SCANS, Nodes, assert_true
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -28,11 +28,6 @@ from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, MAP, POSE, ROBOT_STATUS, SCAN, TFMessage
 from hmt_slam_ros.saved_map.folder import FORMAT, VERSION, FolderReader
 from hmt_slam_ros.sensors import Odometry, Scan
-
-
-@pytest.fixture(scope="module")
-def corridor(tmp_path_factory):
-    return mapped_corridor(tmp_path_factory.mktemp("corridor"))
 
 
 def kill(process):

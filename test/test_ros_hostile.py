@@ -14,6 +14,7 @@ from urllib.request import urlopen
 
 import pytest
 from logs_for_nodes import corridor_bag
+from preloaded import hmt_slam
 from test_ros_replay import children_of
 from test_ros_two_systems import free_port
 
@@ -28,7 +29,7 @@ ROOT = Path(__file__).resolve().parent.parent
 NODES = {*process_names(), "robot", "view", "explorer"}
 BEFORE = 30
 """Scans before the attack, in which all nodes take the memory that they need."""
-SCANS = 300
+SCANS = 200
 GROWTH = 60e6
 """Memory that a node may take for what it refuses, bytes: DDS keeps buffers of the size of the largest messages."""
 ANSWER_TIME = 30.0
@@ -64,12 +65,15 @@ class Attack:
         if self._process is None and scans >= BEFORE:
             threading.Thread(target=watch_page, args=(self._port,), daemon=True).start()
             self.pids = children_of(os.getpid())
-            self.before = {name: current_rss(pid) for name, pid in self.pids.items()}
             command = [sys.executable, str(ROOT / "test" / "hostile.py"), str(self.report)]
             with (self._folder / "stranger.log").open("w") as log:
                 self._process = subprocess.Popen(command, env=environment_of(self.pids["slam"]), stdout=log, stderr=log)
         if self._process is not None:
             assert self._process.poll() is None, (self._folder / "stranger.log").read_text()
+        ready = self.report.with_suffix(".ready")
+        if ready.exists():
+            self.before = {name: current_rss(pid) for name, pid in self.pids.items()}
+            ready.unlink()
         if self.report.exists() and not self.after:
             assert children_of(os.getpid()) == self.pids
             self.after = {name: current_rss(pid) for name, pid in self.pids.items()}
@@ -97,8 +101,7 @@ def run(tmp_path_factory):
     """Output folders of a log, mapped with a stranger and in lock-step, and the attack."""
     folder = tmp_path_factory.mktemp("hostile")
     log = corridor_bag(folder, scans=SCANS)
-    arguments = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(folder / "map")]
-    subprocess.run([*arguments, "--set", "robot.rate=0.4"], cwd=ROOT, check=True, timeout=280, capture_output=True)
+    hmt_slam("map", log, "--out", folder / "map", "--set", "robot.rate=1.0", check=True)
     port = free_port()
     attack = Attack(folder, port)
     begin = time.monotonic()
@@ -106,7 +109,7 @@ def run(tmp_path_factory):
         patch.chdir(folder)
         patch.setenv("PYTHONPATH", str(ROOT))
         try:
-            replay(log, folder / "out", load_configuration(settings=["robot.rate=0.4"]), attack.watch, view_port=port)
+            replay(log, folder / "out", load_configuration(settings=["robot.rate=1.0"]), attack.watch, view_port=port)
         finally:
             attack.end()
     grown = {name: f"{(attack.after[name] - attack.before[name]) / 1e6:.0f} MB" for name in attack.after}

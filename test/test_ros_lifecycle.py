@@ -60,7 +60,7 @@ def test_a_value_out_of_range_keeps_every_node_from_starting(tmp_path, start):
 def test_a_node_that_is_still_being_loaded_ends_well_on_request(start, number):
     processes = []
     for moment in range(6):
-        processes.append(start("slam"))
+        processes.append(start("slam", preload=False))
         while not heeds_sigterm(processes[-1].pid):
             time.sleep(0.01)
         time.sleep(0.3 * moment)

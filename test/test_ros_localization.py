@@ -1,14 +1,13 @@
 """Nodes that start from a map, or whose robot is kidnapped, do not know where it is until they recognize the place."""
 
 import math
-import subprocess
-import sys
 from collections import defaultdict
 from itertools import groupby, islice
 
 import numpy as np
 import pytest
-from logs_for_nodes import PACE, corridor_bag
+from logs_for_nodes import MAPPED_SCANS as SCANS
+from logs_for_nodes import PACE
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -25,22 +24,7 @@ from hmt_slam_ros.ros.conversions import pose_from_message, pose_with_covariance
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, ENTROPY, IS_LOCALIZED, POSE
 
 NODES = process_names()
-SCANS = 120
 CARRIED = "sim:office,seed=3,size=0.7,laps=1,carried=0.35,to=0.08,turned=120"
-
-
-def mapped_corridor(folder):
-    """The log of the corridor, and its map by the command line."""
-    log, out = corridor_bag(folder, scans=SCANS), folder / "out"
-    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(out)]
-    subprocess.run(command, check=True, timeout=120)
-    return log, out
-
-
-@pytest.fixture(scope="module")
-def corridor(tmp_path_factory):
-    """The log of the corridor, and the folder of its map."""
-    return mapped_corridor(tmp_path_factory.mktemp("corridor"))
 
 
 class Nodes:

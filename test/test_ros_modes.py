@@ -1,12 +1,10 @@
 """Localization: the robot finds its place in a map that stays as it was loaded, until the mode is changed."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from logs_for_nodes import PACE
-from test_ros_localization import SCANS, Nodes, initial_pose, mapped_corridor
+from preloaded import hmt_slam
+from test_ros_localization import SCANS, Nodes, initial_pose
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -20,11 +18,6 @@ from hmt_slam_ros.messages.documents import KeyframeHeader, decode
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import pose_from_message
 from hmt_slam_ros.ros.topics import INITIAL_POSE, KEYFRAMES
-
-
-@pytest.fixture(scope="module")
-def corridor(tmp_path_factory):
-    return mapped_corridor(tmp_path_factory.mktemp("corridor"))
 
 
 def content(folder):
@@ -93,10 +86,9 @@ def test_offline_too_the_map_stays_as_it_was(corridor, tmp_path):
     log, out = corridor
 
     def run_map(*arguments):
-        command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(tmp_path / "out")]
-        return subprocess.run([*command, *arguments], check=False, capture_output=True, text=True, timeout=120)
+        return hmt_slam("map", log, "--out", tmp_path / "out", *arguments)
 
-    found = run_map("--from", str(out), "--mode", "localization", "--start", "4.0")
+    found = run_map("--from", out, "--mode", "localization", "--start", "4.0")
     assert found.returncode == 0, found.stderr
     assert content(tmp_path / "out" / "hmt_map") == content(out / "hmt_map")
     poses = np.loadtxt(tmp_path / "out" / "trajectory.tum")

@@ -3,12 +3,11 @@
 import math
 import os
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from door_floor import ROOM, in_hallway, scripted_drive, write_world
+from preloaded import hmt_slam
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -32,8 +31,7 @@ def mapped_world(tmp_path_factory):
     """The world, and the folder of its map."""
     folder = tmp_path_factory.mktemp("floor")
     world, out = write_world(folder), folder / "out"
-    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", world, "--out", str(out)]
-    subprocess.run(command, check=True, timeout=120)
+    hmt_slam("map", world, "--out", out, check=True)
     return world, out
 
 

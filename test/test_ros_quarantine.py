@@ -1,66 +1,20 @@
 """A message on which a process raises an error is set aside: the process is rebuilt, also after a kill."""
 
 import json
-import os
 import signal
-import sys
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
+import sixth_process
+from sixth_process import FATAL, NAME, POISON
 
-from hmt_slam_ros import process_table
-from hmt_slam_ros.process_table import ProcessRow, topic_of
+from hmt_slam_ros.process_table import topic_of
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-NAME = "fragile"
-POISON, FATAL = 13.0, 666.0
-"""Ambiguities on which the process raises an error: always, and such that it cannot be rebuilt."""
-
-
-@dataclass(frozen=True)
-class FragileState:
-    """Number of closure decisions so far."""
-
-    decisions: int = 0
-
-
-class Fragile:
-    """A process that counts closure decisions, and changes before it fails."""
-
-    def __init__(self, _configuration, state=None):
-        if Path(os.environ["UNBUILDABLE"]).exists():
-            raise MemoryError("no room")
-        self.state = state or FragileState()
-
-    def handle(self, message):
-        from hmt_slam_ros.messages.messages import Notice  # noqa: PLC0415  when the row is in the table
-
-        self.state = FragileState(self.state.decisions + 1)
-        if message.ambiguity[0, 0] == FATAL:
-            Path(os.environ["UNBUILDABLE"]).touch()
-        if message.ambiguity[0, 0] in (POISON, FATAL):
-            raise ZeroDivisionError("a fault of the program")
-        return [Notice(NAME, f"decisions: {self.state.decisions}")]
-
-
-ROW = ProcessRow(
-    name=NAME,
-    title="counts closure decisions",
-    consumes=("ClosureDecision",),
-    factory="test_ros_quarantine:Fragile",
-    state="test_ros_quarantine:FragileState",
-)
-
-
-def add_row():
-    process_table.PROCESSES = (*process_table.PROCESSES, ROW)
-
 
 class Node:
-    """The node of the fragile process, and what it publishes."""
+    """The node of the sixth process, and what it publishes."""
 
     def __init__(self, listener, start, recovery):
         from diagnostic_msgs.msg import DiagnosticArray  # noqa: PLC0415  only where there is ROS
@@ -114,11 +68,7 @@ class Node:
 @pytest.fixture
 def node(tmp_path, monkeypatch, listener, start):
     """The node, not started yet."""
-    site = tmp_path / "site"
-    site.mkdir()
-    (site / "sitecustomize.py").write_text("import test_ros_quarantine\ntest_ros_quarantine.add_row()\n")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), str(Path(__file__).parent), *sys.path]))
-    monkeypatch.setenv("UNBUILDABLE", str(tmp_path / "unbuildable"))
+    sixth_process.add_to_programs(tmp_path, monkeypatch)
     return Node(listener, start, tmp_path / "recovery")
 
 

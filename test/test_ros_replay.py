@@ -9,11 +9,14 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.request import urlopen
 
 import numpy as np
+import preloaded
 import pytest
 from logs_for_nodes import corridor_bag, is_alive
+from preloaded import hmt_slam
 
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.evaluation import read_tum
@@ -24,11 +27,11 @@ from hmt_slam_ros.results.hmt_map import read_saved_map
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
 from hmt_slam_ros.process_table import RUN_NODE, process_names
+from hmt_slam_ros.ros import node_processes
 from hmt_slam_ros.ros.replay import replay
 
 ROOT = Path(__file__).resolve().parent.parent
 BUNDLED = ROOT / "data" / "malaga_one_loop"
-COMMAND = (sys.executable, "-m", "hmt_slam_ros.cli.main")
 NODES = {*process_names(), "robot"}
 
 
@@ -58,12 +61,8 @@ def wait_until(condition, seconds=60.0):
 def running(tmp_path):
     """A replay in real time of a drive of 40 s, that has all its nodes."""
     log = corridor_bag(tmp_path, 200)
-    process = subprocess.Popen(
-        [*COMMAND, "replay", str(log), "--out", str(tmp_path / "out"), "--rate", "1.0"],
-        cwd=ROOT,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    words = ("replay", log, "--out", tmp_path / "out", "--rate", 1.0)
+    process = preloaded.start(preloaded.COMMAND, *words, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     wait_until(lambda: set(children_of(process.pid)) == NODES or process.poll() is not None)
     nodes = children_of(process.pid)
     yield process, nodes
@@ -73,19 +72,35 @@ def running(tmp_path):
     wait_until(lambda: not any(is_alive(pid) for pid in nodes.values()))
 
 
-def mapped_twice(log, top):
-    """The output folders of a log, mapped by the nodes and in lock-step."""
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """The output folders of the bundled log, mapped by the nodes and in lock-step, by the two commands."""
+    top = tmp_path_factory.mktemp("runs")
     for command in ("replay", "map"):
-        arguments = [*COMMAND, command, str(log), "--out", str(top / command), "--set", "robot.rate=0"]
-        done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, timeout=280, check=False)
-        assert done.returncode == 0, done.stderr
+        hmt_slam(command, BUNDLED, "--out", top / command, "--set", "robot.rate=0", check=True)
     return top / "replay", top / "map"
 
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory):
-    """The bundled log, mapped by the nodes and in lock-step."""
-    return mapped_twice(BUNDLED, tmp_path_factory.mktemp("runs"))
+@pytest.fixture
+def map_twice(tmp_path, monkeypatch):
+    """Maps a log by nodes, which have their libraries loaded before, and in lock-step; returns the output folders."""
+
+    def start_preloaded(command, **options):
+        return preloaded.start(*command[2:], **options)
+
+    def run(log, *settings):
+        settings = ("robot.rate=0.0", *settings)
+        nodes, lock_step = tmp_path / "replay", tmp_path / "map"
+        with monkeypatch.context() as patch:
+            patch.setattr(
+                node_processes, "subprocess", SimpleNamespace(**vars(subprocess) | {"Popen": start_preloaded})
+            )
+            replay(log, nodes, load_configuration(settings=settings))
+        words = [word for setting in settings for word in ("--set", setting)]
+        hmt_slam("map", log, "--out", lock_step, *words, check=True)
+        return nodes, lock_step
+
+    return run
 
 
 @pytest.mark.parametrize("name", ["trajectory.tum", "trajectory_online.tum", "graph.g2o", "pmf.csv", "map.pgm"])
@@ -94,8 +109,8 @@ def test_the_nodes_take_the_same_decisions_as_the_lock_step_run(folders, name):
     assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
 
 
-def test_the_nodes_correct_scans_for_the_motion_during_their_sweeps_as_the_lock_step_run_does(tmp_path):
-    nodes, lock_step = mapped_twice(corridor_bag(tmp_path, scans=60, sweep=0.15), tmp_path)
+def test_the_nodes_correct_scans_for_the_motion_during_their_sweeps_as_the_lock_step_run_does(map_twice, tmp_path):
+    nodes, lock_step = map_twice(corridor_bag(tmp_path, scans=60, sweep=0.15))
     scans, others = (read_saved_map(folder / "hmt_map").replica.scans for folder in (nodes, lock_step))
     assert {k: scan.motion.tobytes() for k, scan in scans.items()} == {k: s.motion.tobytes() for k, s in others.items()}
     # The log ends within the last sweep.
@@ -108,22 +123,22 @@ def test_the_nodes_correct_scans_for_the_motion_during_their_sweeps_as_the_lock_
         assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
 
 
-def test_the_nodes_have_two_areas_become_one_as_the_lock_step_run_does(tmp_path):
-    nodes, lock_step = mapped_twice("sim:ring,seed=3,size=1.5", tmp_path)
+def test_the_nodes_have_two_areas_become_one_as_the_lock_step_run_does(map_twice):
+    nodes, lock_step = map_twice("sim:grid,seed=1,count=2", "robot.duration=110.0")
     table = np.genfromtxt(nodes / "pmf.csv", delimiter=",", names=True, usecols=("keyframe", "areas"))
     assert np.diff(table["areas"]).min() < 0
     for name in ("trajectory.tum", "trajectory_online.tum", "pmf.csv", "hmt_map/map.json", "hmt_map/map.bin"):
         assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
 
 
-def test_the_nodes_forget_the_keyframes_that_the_lock_step_run_forgets(tmp_path):
+def test_the_nodes_forget_the_keyframes_that_the_lock_step_run_forgets(map_twice):
     name = "sim:office,size=0.7,rate=1.5,laps=2"
     log, run = open_log(name), LockStepRun(Configuration())
     for record in log.records():
         run.process_record(record)
     gone = {one.keyframe for answer in run.recorder.hypotheses.values() for one in answer.pruned_keyframes}
     assert len(gone) > 3
-    nodes, lock_step = mapped_twice(name, tmp_path)
+    nodes, lock_step = map_twice(name)
     assert not gone & read_saved_map(nodes / "hmt_map").replica.scans.keys()
     for file in ("trajectory.tum", "trajectory_online.tum", "pmf.csv", "hmt_map/map.json", "hmt_map/map.bin"):
         assert (nodes / file).read_bytes() == (lock_step / file).read_bytes()
@@ -237,13 +252,14 @@ def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path):
 def test_the_live_page_of_a_run_is_served_while_it_lasts_though_it_is_killed_unless_its_port_is_taken(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        log, out = str(corridor_bag(tmp_path, 200)), str(tmp_path / "out")
-        command = [*COMMAND, "replay", log, "--out", out, "--set", "robot.rate=4", "--view", str(port)]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+        log, out = corridor_bag(tmp_path, 200), tmp_path / "out"
+        words = ("replay", log, "--out", out, "--set", "robot.rate=4", "--view", port)
+        done = hmt_slam(*words, timeout=60.0)
     assert done.returncode == 2
     assert f"the page cannot listen on 127.0.0.1, port {port}" in done.stderr.splitlines()[-1]
 
-    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    outputs = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with preloaded.start(preloaded.COMMAND, *words, cwd=ROOT, **outputs) as process:
         url = process.stderr.readline().split()[-1]
 
         def read_screen():
@@ -276,8 +292,7 @@ def test_a_truncated_log_is_one_sentence_before_anything_starts(tmp_path):
     log = corridor_bag(tmp_path)
     (storage,) = log.glob("*.mcap")
     storage.write_bytes(storage.read_bytes()[: storage.stat().st_size // 2])
-    arguments = [*COMMAND, "replay", str(log), "--out", str(tmp_path / "out")]
-    done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    done = hmt_slam("replay", log, "--out", tmp_path / "out", timeout=60.0)
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1
     assert not (tmp_path / "out").exists()

@@ -1,13 +1,12 @@
 """The nodes save one map together while they run, and begin with it again."""
 
 import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
 from logs_for_nodes import PACE, START, corridor_bag
+from preloaded import hmt_slam
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -144,8 +143,7 @@ def test_nodes_that_have_to_end_save_their_map_first_if_that_is_wanted(tmp_path,
 
 def test_nodes_show_a_map_of_the_command_line_at_once_and_go_on_from_it(tmp_path, listener, start):
     log, out = corridor_bag(tmp_path, scans=60), tmp_path / "out"
-    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(log), "--out", str(out), "--duration", "6"]
-    subprocess.run(command, check=True, timeout=120)
+    hmt_slam("map", log, "--out", out, "--duration", 6, check=True)
     grids = listener.subscribe(OccupancyGrid, MAP, topics.LATCHED)
     stayed = start_with(start, start_from=out, start_lost=False)
     nodes = Nodes(stayed, listener, log, tmp_path / "hmt_map", 0.0, robot__start=6.001)
@@ -174,8 +172,7 @@ def test_what_cannot_be_saved_is_reported(tmp_path, listener, start):
 
 def test_a_map_that_is_damaged_or_made_with_other_particles_keeps_the_nodes_from_starting(tmp_path, start):
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(corridor_bag(tmp_path)), "--out", str(out)]
-    subprocess.run(command, check=True, timeout=120)
+    hmt_slam("map", corridor_bag(tmp_path), "--out", out, check=True)
     node = start("slam", start_from=out, filter__particles=5)
     assert "made with filter.particles = 12, not with filter.particles = 5" in node.communicate(timeout=40)[1]
     assert node.returncode == 2

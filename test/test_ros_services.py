@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from logs_for_nodes import PACE
-from test_ros_localization import NODES, SCANS, Nodes, mapped_corridor
+from test_ros_localization import NODES, SCANS, Nodes
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -33,11 +33,6 @@ SAID = {f"/{topic.lstrip('/')}" for topic in {*NAMED, *topics.DOCUMENTS.values()
     *("/goal_pose", "/pilot/place_estimate"),  # of explorer and pilot
     "/hmt/notices",  # as there is nothing to complain of
 }
-
-
-@pytest.fixture(scope="module")
-def corridor(tmp_path_factory):
-    return mapped_corridor(tmp_path_factory.mktemp("corridor"))
 
 
 def count_occupied(grid):

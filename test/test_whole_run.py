@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from preloaded import hmt_slam
 
 from hmt_slam_ros.area_abstraction.overlap_graph import overlaps, sensed_points
 from hmt_slam_ros.evaluation import read_tum
@@ -22,15 +23,13 @@ LOG = Path(__file__).parents[1] / "data" / "malaga_one_loop"
 SCANS = 225
 
 
-def run_map(folder, *options):
-    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(LOG), "--out", str(folder), *options]
-    subprocess.run(command, check=True, timeout=300)
-    return folder
-
-
 @pytest.fixture(scope="module")
 def output(tmp_path_factory):
-    return run_map(tmp_path_factory.mktemp("runs") / "first")
+    """The map of a newcomer, by a process that has nothing loaded before."""
+    folder = tmp_path_factory.mktemp("runs") / "first"
+    command = [sys.executable, "-m", "hmt_slam_ros.cli.main", "map", str(LOG), "--out", str(folder)]
+    subprocess.run(command, check=True, timeout=300)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +99,8 @@ def test_where_the_robot_drives_its_first_meters_again_the_walls_are_single(outp
 
 
 def test_one_seed_gives_the_same_bytes(output, tmp_path):
-    again = run_map(tmp_path / "again")
+    again = tmp_path / "again"
+    hmt_slam("map", LOG, "--out", again, check=True)
     names = ["trajectory.tum", "trajectory_online.tum", "graph.g2o", "map.pgm", "pmf.csv"]
     names += [str(p.relative_to(output)) for p in sorted((output / "hmt_map").rglob("*")) if p.is_file()]
     assert len(names) > 10
@@ -108,6 +108,7 @@ def test_one_seed_gives_the_same_bytes(output, tmp_path):
 
 
 def test_another_seed_gives_nearly_the_same_path(output, tmp_path):
-    other = run_map(tmp_path / "other", "--seed", "1")
+    other = tmp_path / "other"
+    hmt_slam("map", LOG, "--out", other, "--seed", 1, check=True)
     difference = se2.between(read_tum(output / "trajectory.tum").poses, read_tum(other / "trajectory.tum").poses)
     assert np.hypot(*difference[:, :2].T).max() < 0.1
