@@ -29,14 +29,15 @@ PROCESSES = process_names()
 
 
 @pytest.fixture
-def system(tmp_path, start):
-    """Starts all nodes."""
+def system(tmp_path, start, listener):
+    """Starts all nodes, the robot once the test's node knows the explorer, whose first goal may be its only one."""
     world = tmp_path / "world.yaml"
     world.write_text(WORLD)
 
     def start_all(**parameters):
         nodes = [start(name) for name in PROCESSES]
         explorer = start("explorer", laser_pose="[0.0,0.0,0.0]", **parameters)
+        listener.until(lambda: listener.node.count_publishers("goal_pose"))
         robot = start(
             "robot",
             log=f"sim:{world}",

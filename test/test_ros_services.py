@@ -17,11 +17,11 @@ from recording import Recording
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.documents import KeyframeHeader, decode
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import pose_from_message
 from hmt_slam_ros.ros.topics import KEYFRAMES, MAP, TFMessage
 
 TRANSFORMS = {"tf", "tf_static"} if TFMessage else set()
@@ -73,8 +73,7 @@ def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corr
     nodes.drive(log, first=20, rate=8.0)
     nodes.until(nodes.is_localized)
     nodes.until(lambda: last(nodes).scan_index == SCANS + (SCANS - 20) - 1)
-    end = 4 * (SCANS - 1) * PACE
-    nodes.until(lambda: nodes.poses and np.abs(pose_from_message(nodes.poses[-1].pose.pose) - end).max() < 0.15)
+    nodes.until_at(4 * (SCANS - 1))
 
 
 def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_messages_can_be_recorded(
@@ -94,7 +93,7 @@ def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_messages_can_
     assert decode(keyframes[0].data, KeyframeHeader).sequence == 0
     nodes.until(nodes.is_localized)
     # In the frame of the first scan after it.
-    nodes.until(lambda: nodes.poses and abs(pose_from_message(nodes.poses[-1].pose.pose)[0] - 4 * 39 * PACE[0]) < 0.3)
+    nodes.until_at(4 * 79, se2.between(4 * 40 * PACE, 4 * 79 * PACE), tolerance=0.3)
     assert count_occupied(listener.call(GetMap, "tlca/get_map", GetMap.Request()).map) > 20
     assert listener.call(Trigger, "slam/save", Trigger.Request()).success
     nodes.until(lambda: set(recording.counts) >= SAID)
