@@ -8,7 +8,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors import Odometry
 from hmt_slam_ros.sensors.motion_model import MotionModel
 from hmt_slam_ros.sensors.relative_motion import RelativeMotion, increment_covariance
-from hmt_slam_ros.sensors.stale_odometry import count_steady_steps
+from hmt_slam_ros.sensors.stale_odometry import MAX_STEPS, SteadyMotionSearch
 
 PERIOD = 200_000_000
 """Time between two scans, ns."""
@@ -112,7 +112,7 @@ def test_a_reset_is_no_motion_over_any_time():
     expected = RelativeMotion(se2.exp(0.2 * TURNING), np.diag([0.04, 0.04, 0.1]))
     reset = [np.array([30.0, 5.0, 2.0])] * 12
     change = np.diag([1e-3, 1e-3, 1e-2])
-    assert count_steady_steps(poses[-1], reset, expected, change, lambda _: change, 0.01) is None
+    assert SteadyMotionSearch(poses[-1], expected, change, lambda _: change, 0.01).extend(reset) is None
 
 
 def test_a_scan_waits_for_its_patience_and_no_longer():
@@ -139,3 +139,24 @@ def test_the_decision_does_not_depend_on_when_readings_arrive():
         if k:
             model.observe(se2.between(truth[k - 1], truth[k]), SHARP)
     assert decisions == one_by_one[:31]
+
+
+def test_scans_that_are_much_closer_than_readings_are_decided_on_in_bounded_steps():
+    model, used = MotionModel(MOTION), []
+    poses_at = model.odometry.poses_at
+
+    def count_poses(stamps):
+        for pose in poses_at(stamps):
+            used.append(pose)
+            yield pose
+
+    model.odometry.poses_at = count_poses
+    # It stands, then leaps, again and again: no steady motion, however long one waits.
+    for k in range(80):
+        model.odometry.add(Odometry(k * PERIOD // 4, np.array([0.5 * (k // 4), 0.0, 0.0])))
+    for stamp in (PERIOD, PERIOD + 600, 2 * PERIOD, 2 * PERIOD + 600):
+        decisions = {model.settle_odometry(stamp) for _ in range(5)}
+        assert decisions == {0.0}
+        model.predict(stamp)
+        model.observe(np.zeros(3), SHARP)
+    assert len(used) <= 4 * MAX_STEPS

@@ -14,7 +14,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import matrix_inverse
 from hmt_slam_ros.sensors.odometry import Odometry, OdometryBuffer
 from hmt_slam_ros.sensors.relative_motion import NO_MOTION, RelativeMotion, increment_covariance, squared_accelerations
-from hmt_slam_ros.sensors.stale_odometry import count_steady_steps
+from hmt_slam_ros.sensors.stale_odometry import MAX_STEPS, SteadyMotionSearch
 
 _RECENT_WEIGHT, _LONG_TERM_WEIGHT = 0.1, 0.02
 """Weight of the newest period between scans in the recent mean, and in the mean that outlasts a burst."""
@@ -262,6 +262,7 @@ class MotionModel:
         self._motion = motion
         self._inertia = Inertia(motion, state.inertia)
         self._squared_accelerations = squared_accelerations(motion)
+        self._search: tuple[int, Odometry | None, SteadyMotionSearch] | None = None
         # All but the three parts above, which change in place.
         self._state = replace(state, readings=(), noise=OdometryNoiseState(), inertia=None)
 
@@ -287,21 +288,37 @@ class MotionModel:
         if last is None or self._state.interpolation_gap is None or stamp <= last:
             return 0.0
         interval = stamp - last
-        seconds = interval * 1e-9
-        stamps = range(stamp, stamp + round(self._motion.patience * 1e9) + 1, interval)
-        steps = count_steady_steps(
-            self._state.odometry_pose,
-            self.odometry.poses_at(stamps),
-            self._inertia.forecast(seconds)[0],
-            self._squared_accelerations * seconds**4,
-            lambda step: self.noise.scale(RelativeMotion(step, increment_covariance(step, self._motion))).covariance,
-            self._motion.fault_probability,
-        )
+        count = min(MAX_STEPS, 1 + round(self._motion.patience * 1e9) // interval)
+        stamps = range(stamp, stamp + count * interval, interval)
+        search = self._steady_motion_search(stamp, interval * 1e-9)
+        steps = search.extend(self.odometry.poses_at(stamps[search.step_count :]))
         if steps is None:
             return 0.0 if self.odometry.covers(stamps[-1]) else None
         if steps > 1:
             self.odometry.remove_between(last, last + steps * interval)
-        return (steps - 1) * seconds
+        return (steps - 1) * interval * 1e-9
+
+    def _steady_motion_search(self, stamp: int, seconds: float) -> SteadyMotionSearch:
+        """The search that goes on while a scan waits, new for each scan and sequence of readings.
+
+        :param seconds: from the last scan to the scan at ``stamp`` (ns).
+        """
+        first = self.odometry.readings[0] if self.odometry.readings else None
+        if self._search is None or self._search[0] != stamp or self._search[1] is not first:
+            search = SteadyMotionSearch(
+                self._state.odometry_pose,
+                self._inertia.forecast(seconds)[0],
+                self._squared_accelerations * seconds**4,
+                lambda step: (
+                    self.noise.scale(RelativeMotion(step, increment_covariance(step, self._motion))).covariance
+                ),
+                self._motion.fault_probability,
+            )
+            self._search = (stamp, first, search)
+        return self._search[2]
+
+    def _odometry_covariance(self, step: Float64) -> Float64:
+        return self.noise.scale(RelativeMotion(step, increment_covariance(step, self._motion))).covariance
 
     def predict(self, stamp: int) -> Prediction:
         """The motion from the last scan to the scan at ``stamp``, ns; none at the first scan."""

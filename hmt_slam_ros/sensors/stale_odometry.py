@@ -17,52 +17,66 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import matrix_inverse
 from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 
+MAX_STEPS = 100
+"""Steps in which a steady motion is looked for, at most: scans may be much closer to each other than readings."""
 
-def count_steady_steps(
-    start: Float64,
-    poses: Iterable[Float64],
-    expected: RelativeMotion,
-    change: Float64,
-    noise: Callable[[Float64], Float64],
-    fault_probability: float,
-) -> int | None:
-    """Steps over which the robot went on steadily: 1 where the first is as it was read, None where more poses decide.
+
+class SteadyMotionSearch:
+    """Looks for the steps over which a robot went on steadily, as more and more of them become known.
 
     Costs are half squared Mahalanobis distances, nats. What costs more than a fault, by its probability, contradicts.
-
-    :param start: ``odom_T_base`` (3,) at the last scan.
-    :param poses: ``odom_T_base`` (3,) after equal steps of time since then.
-    :param expected: the motion of the first step by inertia.
-    :param change: covariance (3, 3) of the change of motion from step to step.
-    :param noise: the covariance (3, 3) of odometry over a motion, a twist (3,).
-    :param fault_probability: of stale odometry.
     """
-    fault, velocity = -math.log(fault_probability), se2.log(expected.increment)
-    motions: list[Float64] = []
-    last = start
-    for count, pose in enumerate(poses, start=1):
-        step, last = se2.log(se2.between(last, pose)), pose
+
+    def __init__(
+        self,
+        start: Float64,
+        expected: RelativeMotion,
+        change: Float64,
+        noise: Callable[[Float64], Float64],
+        fault_probability: float,
+    ) -> None:
+        """
+        :param start: ``odom_T_base`` (3,) at the last scan.
+        :param expected: the motion of the first step by inertia.
+        :param change: covariance (3, 3) of the change of motion from step to step.
+        :param noise: the covariance (3, 3) of odometry over a motion, a twist (3,).
+        :param fault_probability: of stale odometry.
+        """
+        self._start, self._last, self._expected, self._change, self._noise = start, start, expected, change, noise
+        self._velocity, self._fault = se2.log(expected.increment), -math.log(fault_probability)
+        # Of each step from the start: the motion, a twist, and the variances of odometry over it.
+        self._motions, self._variances = np.empty((MAX_STEPS, 3)), np.empty((MAX_STEPS, 3))
+        self.step_count = 0
+
+    def extend(self, poses: Iterable[Float64]) -> int | None:
+        """The number of steady steps: 1 where the first is as it was read, None where more poses have to decide.
+
+        :param poses: ``odom_T_base`` (3,) after the next of equal steps of time; at most :data:`MAX_STEPS` in all.
+        """
+        return next((self.step_count for pose in poses if self._is_decided_by(pose)), None)
+
+    def _is_decided_by(self, pose: Float64) -> bool:
+        step, self._last = se2.log(se2.between(self._last, pose)), pose
+        motion = se2.log(se2.between(self._start, pose))
+        self._motions[self.step_count], self._variances[self.step_count] = motion, np.diag(self._noise(motion))
+        self.step_count += 1
         # Velocities walk at random: after n steps by n times the variance of a change, on average by a third of that.
-        walked = (count - 1) * change
-        contradicts = _cost(step - velocity, expected.covariance + walked + noise(step)) > fault
-        if count == 1 and not contradicts:
-            return 1
-        motions.append(se2.log(se2.between(start, pose)))
-        if count == 1 or not contradicts:
-            continue
-        steady = motions[-1] / count
-        cost = _cost(steady - velocity, expected.covariance + walked / 3.0 + noise(steady))
-        cost += sum(_lag_cost(motion, k * steady, noise(motion)) for k, motion in enumerate(motions, start=1))
-        if cost <= fault:
-            return count
-    return None
+        walked = (self.step_count - 1) * self._change
+        contradicts = self._cost(step, walked) > self._fault
+        if self.step_count == 1:
+            return not contradicts
+        steady = motion / self.step_count
+        return contradicts and self._cost(steady, walked / 3.0) + self._lag_cost(steady) <= self._fault
 
+    def _cost(self, step: Float64, walked: Float64) -> float:
+        """The cost of a step, a twist (3,), against the velocity before."""
+        difference = step - self._velocity
+        information = matrix_inverse(self._expected.covariance + walked + self._noise(step))
+        return 0.5 * float(difference @ information @ difference)
 
-def _cost(difference: Float64, covariance: Float64) -> float:
-    return 0.5 * float(difference @ matrix_inverse(covariance) @ difference)
-
-
-def _lag_cost(motion: Float64, steady: Float64, noise: Float64) -> float:
-    """The cost of a motion, a twist (3,), that should lie between none and the steady one, as a reading that lags."""
-    difference = motion - np.clip(motion, np.minimum(steady, 0.0), np.maximum(steady, 0.0))
-    return 0.5 * float((difference**2 / np.diag(noise)).sum())
+    def _lag_cost(self, step: Float64) -> float:
+        """The cost of motions that should lie between none and the steady one, as readings that lag."""
+        motions, variances = self._motions[: self.step_count], self._variances[: self.step_count]
+        steady = np.arange(1, self.step_count + 1)[:, None] * step
+        differences = motions - np.clip(motions, np.minimum(steady, 0.0), np.maximum(steady, 0.0))
+        return 0.5 * float((differences**2 / variances).sum())
