@@ -70,9 +70,8 @@ def redundant_keyframes(
     if not keyframe_poses:
         return []
     keyframes = np.array(sorted(keyframe_poses))
-    poses, count = np.array([keyframe_poses[keyframe] for keyframe in sorted(keyframe_poses)]), len(keyframes)
-    relative = se2.between(np.repeat(poses, count, 0), np.tile(poses, (count, 1)))
-    is_shared = is_same_viewpoint(relative, settings).reshape(count, count)
+    poses = np.array([keyframe_poses[keyframe] for keyframe in sorted(keyframe_poses)])
+    is_shared = is_same_viewpoint(se2.between(poses[:, None], poses), settings)
     is_prunable = ~np.isin(keyframes, list(protected))
     pruned: list[int] = []
     while True:

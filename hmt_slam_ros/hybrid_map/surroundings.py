@@ -25,6 +25,9 @@ from hmt_slam_ros.sensors.polar_scan import FREE, classify_points, to_polar_scan
 
 Pose = Float64
 
+_ORIGIN = np.zeros(3)
+"""Pose of a frame in itself."""
+
 NO_AREA = -1
 """Stands for no area in arrays of areas."""
 
@@ -147,7 +150,7 @@ def areas_around(
 ) -> dict[int, PoseGaussian]:
     """{other area: belief over ``area_T_other``}, the area itself first, then by growing uncertainty."""
     beliefs = shortest_path_beliefs(hybrid_map, area, neighborhood.max_sigma**2, _MAX_NEIGHBORS)
-    own = keyframe_positions(hybrid_map, area, np.zeros(3))
+    own = keyframe_positions(hybrid_map, area)
     found = {}
     for other, belief in beliefs.items():
         is_near = (
@@ -169,8 +172,8 @@ def has_same_poses(first: Mapping[int, Pose], second: Mapping[int, Pose]) -> boo
     return first.keys() == second.keys() and all(np.array_equal(pose, second[k]) for k, pose in first.items())
 
 
-def keyframe_positions(hybrid_map: HybridMap, area: int, pose: Pose) -> Float64:
-    """Positions of an area's keyframes, shape (n, 2), m, where the area's frame is at ``pose``."""
+def keyframe_positions(hybrid_map: HybridMap, area: int, pose: Pose = _ORIGIN) -> Float64:
+    """Positions of an area's keyframes, shape (n, 2), m, where the area's frame is at ``pose``; by default in it."""
     return se2.transform(pose, stack_poses(hybrid_map.keyframes(area))[:, :2])
 
 

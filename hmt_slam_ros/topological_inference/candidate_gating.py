@@ -132,7 +132,7 @@ class CandidateGating:
         for area, prior in within.items():
             unmatched = {k: pose for k, pose in query.poses.items() if k not in matched.get(area, ())}
             if 2 * len(unmatched) >= len(query.poses) and self._is_within_reach(hybrid_map, area, prior, unmatched):
-                positions = keyframe_positions(hybrid_map, area, np.zeros(3))
+                positions = keyframe_positions(hybrid_map, area)
                 bound = sampled_entry_bound(positions, prior, stack_poses(unmatched), self._options.place_radius)
                 if bound > 0.0:
                     candidates[area] = AreaCandidate(prior, unmatched, bound)
@@ -149,8 +149,9 @@ class CandidateGating:
         """Whether a keyframe of the area is near enough to one of the query's, somewhere within the gate."""
         positions = se2.compose(prior.mean, stack_poses(poses))[:, :2]
         lever = float(np.hypot(*(positions - prior.mean[:2]).T).max())
-        spread = math.sqrt(np.linalg.eigvalsh(prior.covariance[:2, :2])[-1]) + lever * math.sqrt(prior.covariance[2, 2])
-        known = keyframe_positions(hybrid_map, area, np.zeros(3))
+        widest = math.sqrt(np.linalg.eigvalsh(prior.covariance[:2, :2]).max())
+        spread = widest + lever * math.sqrt(prior.covariance[2, 2])
+        known = keyframe_positions(hybrid_map, area)
         return min_distance(positions, known) <= self._options.place_radius + math.sqrt(self.gate) * spread
 
 

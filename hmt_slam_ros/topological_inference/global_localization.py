@@ -182,7 +182,7 @@ def _areas_near_hint(hybrid_map: HybridMap, pose_hint: PoseHint, radius: float, 
     """{area: belief over ``hint_area_T_area``} of those in which the reference may be."""
     if not hybrid_map.has_area(pose_hint.area):
         return {}
-    reach = radius + _HINT_DEVIATIONS * math.sqrt(float(np.linalg.eigvalsh(pose_hint.pose.covariance[:2, :2])[-1]))
+    reach = radius + _HINT_DEVIATIONS * math.sqrt(float(np.linalg.eigvalsh(pose_hint.pose.covariance[:2, :2]).max()))
     near = {}
     for area, belief in connected_areas(hybrid_map, pose_hint.area).items():
         if min(hybrid_map.keyframes(area), default=before) >= before:

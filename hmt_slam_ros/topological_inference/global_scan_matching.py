@@ -56,13 +56,17 @@ _SAMPLE_STRIDE = 3
 """One of so many surface samples is matched."""
 
 _SURFACE_LOG_RATIO = math.log(3.0)
-"""Log-ratio of a sample on a known surface, nats."""
+"""Log-ratio of a sample amid a known surface, nats; beside its middle it is smaller."""
 
 _MIN_LOG_RATIO = 0.5 * _SURFACE_LOG_RATIO
 """Smallest mean log-ratio of a match, nats. Surface in known free space does not count: furniture moves."""
 
 _SHARE_MARGIN = 0.15
-"""Matches with a matched share so much smaller than the best do not matter."""
+"""Matched share below that of the best match, at which matches in later regions do not matter.
+
+They are dropped by their mean log-ratio, as if each matched sample were amid a surface. Most are beside its middle, and
+those in free space count against a match: so also matches are dropped whose share is a little nearer to the best.
+"""
 
 _MAX_MATCHES = 40
 """Most matches per region."""
@@ -83,7 +87,7 @@ class PoseCandidate(NamedTuple):
 
 def is_certain(candidate: PoseCandidate) -> bool:
     """Whether the surfaces alone determine the position in all directions."""
-    variance = float(np.linalg.eigvalsh(candidate.mode.measured.covariance[:2, :2])[-1])
+    variance = float(np.linalg.eigvalsh(candidate.mode.measured.covariance[:2, :2]).max())
     return variance <= _MAX_SIGMA**2
 
 
@@ -263,7 +267,7 @@ def regions(hybrid_map: HybridMap, areas: Collection[int], reach: float) -> list
             continue
         around = areas_around(hybrid_map, area, _region_neighborhood(reach))
         poses = {other: belief.mean for other, belief in around.items() if other in areas}
-        positions = keyframe_positions(hybrid_map, area, np.zeros(3))
+        positions = keyframe_positions(hybrid_map, area)
         own_areas = {
             other
             for other in remaining & poses.keys()
