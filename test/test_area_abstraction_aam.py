@@ -362,3 +362,15 @@ def test_two_areas_are_measured_again_only_where_the_arc_between_them_moved(pair
         (answer,) = process.handle(keyframe(later + 1, AGAIN[-1], estimate(0, 2, pose, stored=False)))
         moved = error == 0.1
         assert (answer.events[0].score != before) == bool(pair_counts) == moved
+
+
+@pytest.mark.parametrize(("deviation", "is_cut"), [(19.0, False), (21.0, True)])
+def test_a_keyframe_whose_heading_is_unknown_leaves_its_area_at_once_and_alone(deviation, is_cut):
+    process = aam(confirmations=3)
+    for k in range(4):
+        process.handle(keyframe(k, THERE[k], estimate(0, 0, se2.between(THERE[0], THERE[k]))))
+        process.handle(stay(k, 0))
+    pose = PoseGaussian(se2.between(THERE[0], THERE[4]), np.diag([0.1, 0.1, np.radians(deviation)]) ** 2)
+    uncertain = HypothesisEstimate(0, 0, pose, True, 0.0, 0.0, Clutter(), 12.0)
+    (answer,) = process.handle(keyframe(4, THERE[4], uncertain))
+    assert [(event.kind, event.keyframes, event.area) for event in answer.events] == [("cut", (4,), 0)] * is_cut

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from hmt_slam_ros.configuration.metric_slam import MotionParameters
+from hmt_slam_ros.configuration.metric_slam import FilterParameters, MotionParameters
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import rotate_covariance
 from hmt_slam_ros.sensors import Odometry
 from hmt_slam_ros.sensors.motion_model import Inertia, MotionModel, OdometryNoise
 from hmt_slam_ros.sensors.odometry import OdometryBuffer
-from hmt_slam_ros.sensors.relative_motion import RelativeMotion, increment_covariance
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion, increment_covariance, is_wide
 
 SECOND = 10**9
 SHARP = np.diag([1e4, 1e4, 1e6])
@@ -228,3 +229,19 @@ def test_two_sources_tell_of_one_motion():
     for both in (narrow.fuse(wide), wide.fuse(narrow)):
         np.testing.assert_allclose(both.increment, [0.075, 0.0, 0.075], atol=2e-3)
         np.testing.assert_allclose(both.covariance, 0.75e-4 * np.eye(3), atol=1e-12)
+
+
+def test_a_pose_is_wide_where_its_heading_is_or_its_position_in_all_directions():
+    settings = FilterParameters(keyframe_distance=0.5, keyframe_angle=20.0)
+
+    def is_wide_in(along, across, heading, theta):
+        covariance = rotate_covariance(np.diag([along, across, np.radians(heading)]) ** 2, theta)
+        return is_wide(covariance, settings)
+
+    for theta in (0.0, 0.7, 2.0):
+        assert is_wide_in(0.01, 0.01, 20.1, theta)
+        assert not is_wide_in(0.01, 0.01, 19.9, theta)
+        assert is_wide_in(2.0, 0.51, 1.0, theta)
+        # A corridor shows where its walls are, and not where along them the robot is.
+        assert not is_wide_in(9.0, 0.49, 1.0, theta)
+        assert not is_wide_in(0.49, 9.0, 1.0, theta)

@@ -168,6 +168,25 @@ def test_without_returns_the_particles_spread_as_odometry_says():
     np.testing.assert_allclose(spread, [0.2, 0.1, 0.05], rtol=0.1)
 
 
+def test_a_scan_of_another_place_than_the_map_leaves_the_pose_as_uncertain_as_the_motion():
+    mapping = LocalMapping(Configuration())
+    area_filter, _ = drive_filter(mapping, steps=30)
+    before, deviations = area_filter.pose, np.array([0.5, 0.5, 0.7])
+    elsewhere = scan_in(box(-0.5, -0.6, 0.7, 0.6), np.zeros(3))
+    prepared = PreparedScan(mapping, elsewhere)
+    wide = RelativeMotion(np.array([2.0, 0.0, 1.0]), np.diag(deviations) ** 2)
+    area_filter.track(prepared, Prediction(wide, wide, fused=wide))
+    step = area_filter.update(prepared, 99)
+    np.testing.assert_allclose(se2.between(before, area_filter.pose), wide.increment, atol=0.005)
+    assert not step.information.any()
+    assert (np.sqrt(np.diag(step.match_error.drift_covariance)) > 0.9 * deviations).all()
+    # A scan that fits the map is measured again.
+    back = RelativeMotion(se2.between(area_filter.pose, before), np.diag([0.05, 0.05, 0.02]) ** 2)
+    fitting = PreparedScan(mapping, scan_in(ROOM, before))
+    area_filter.track(fitting, Prediction(back, back, fused=back))
+    assert area_filter.update(fitting, 100).information.any()
+
+
 def test_a_lost_robot_is_found_by_the_search():
     mapping = LocalMapping(Configuration())
     area_filter, truth = drive_filter(mapping, steps=30)

@@ -39,6 +39,7 @@ from hmt_slam_ros.messages.messages import (
 )
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.sensors.relative_motion import is_wide
 
 _NEAREST_KEYFRAMES = 8
 """Keyframes of an area, the nearest to a scan, whose overlap with it is measured."""
@@ -200,6 +201,8 @@ class Aam:
         if not estimate.stored:
             return None
         partition = self._state.partitions[estimate.hypothesis]
+        if is_wide(estimate.pose.covariance, self._filter):
+            return AreaEvent(estimate.hypothesis, "cut", (newest,), partition.area, 0.0)
         graph = self._graph(partition, estimate.hypothesis, partition.area)
         new_keyframes = partition.new_keyframes | {newest}
         separation = self._policy.find_separation(graph, new_keyframes, newest, partition.door_tracker)

@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration.metric_slam import MotionParameters
+from hmt_slam_ros.configuration.metric_slam import FilterParameters, MotionParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import matrix_inverse, propagate_covariance
 
@@ -77,3 +77,13 @@ def path_standard_deviations(distance: Length, angle: Length, motion: MotionPara
     )
     rotation = (motion.rotation_floor + motion.rotation_from_translation * distance) * _RADIANS
     return translation, rotation + motion.rotation_from_rotation * angle
+
+
+def is_wide(covariance: Float64, settings: FilterParameters) -> bool:
+    """Whether a pose is less certain than keyframes are far from each other: in its heading, or in all directions.
+
+    :param covariance: shape (3, 3), of the pose in its own frame, m and rad.
+    """
+    (xx, xy, _), (_, yy, _), (_, _, turn) = covariance.tolist()
+    least = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)
+    return bool(least > settings.keyframe_distance**2 or turn > math.radians(settings.keyframe_angle) ** 2)

@@ -290,9 +290,12 @@ class ScanMatcher:
         )
         refined = [self._refine(points, points, start, prior, step, view) for start in starts]
         best = self._least_misfit(points, [match, *refined], view)
-        # Relative to unknown space: where nothing fits, the scan shows nothing of the map.
-        unmatched = ScanMatch(prior.mean, np.zeros((3, 3)), prior, step, self._log_fault)
-        return max([unmatched, best], key=lambda candidate: candidate.log_evidence)
+        # Evidence is relative to unknown space: the scan may show nothing of the map, which is as improbable as a fault
+        # against a match that fits it. One that does not has to exceed unknown space.
+        least = self._log_fault if self._fits_map(points, best.pose, view) else 0.0
+        if best.log_evidence > least:
+            return best
+        return ScanMatch(prior.mean, np.zeros((3, 3)), prior, step, self._log_fault)
 
     def _least_misfit(self, points: Float64, matches: list[ScanMatch], view: GridView) -> ScanMatch:
         """The match of least misfit among those of about the largest evidence, which is robust but not precise."""

@@ -23,7 +23,7 @@ from hmt_slam_ros.registration.match_covariance import estimate_match_error
 from hmt_slam_ros.registration.scan_to_map import Prior
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import Prediction
-from hmt_slam_ros.sensors.relative_motion import NO_MOTION
+from hmt_slam_ros.sensors.relative_motion import NO_MOTION, is_wide
 from hmt_slam_ros.submap.local_filter import (
     FilterStep,
     LineFilterState,
@@ -57,6 +57,8 @@ class ParticleFilter:
         self._motion_since_update = NO_MOTION
         self.leader = 0
         self._matcher = ScanMatcher(mapping)
+        # Whether the last scan shows anything of the map.
+        self._shows_map = True
         self.tracking_covariance = np.zeros((3, 3))
         self.residual_covariance = NO_MOTION.covariance
         self.clutter_estimate = ClutterEstimate()
@@ -124,6 +126,7 @@ class ParticleFilter:
         self._motion_since_update = self._motion_since_update.compose(match.predicted_motion)
         leg = PoseGaussian(self._predicted_poses[self.leader], self._motion_since_update.covariance)
         match = self._matcher.check_since_keyframe(points, match, leg, self._motion_since_update, view)
+        self._shows_map = bool(match.hessian.any())
         increment = se2.between(before.mean, match.pose)
         self.poses = se2.compose(self.poses, increment)
         information = map_information(self._motion_since_update.covariance, match.pose[2])
@@ -137,7 +140,11 @@ class ParticleFilter:
 
     def update(self, prepared: PreparedScan, step: int) -> FilterStep:
         """Draw every particle from its optimal proposal, weight it, and resample where the ESS is low."""
-        points, settings = prepared.surfels, self.mapping.configuration
+        settings = self.mapping.configuration
+        points = prepared.surfels
+        if not self._shows_map and is_wide(self._motion_since_update.covariance, settings.filter):
+            # A match from here would end in some minimum, with a covariance that leaves the truth out.
+            points = points[:0]
         prior = map_information(self._motion_since_update.covariance, self.pose[2])
         view, predicted = self._leading_view(), Prior(self._predicted_poses[self.leader], prior)
         static = self._matcher.static_points(points, predicted, self._motion_since_update.covariance, view)

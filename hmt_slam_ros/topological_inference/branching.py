@@ -28,6 +28,7 @@ from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
 from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.sensors.relative_motion import is_wide
 from hmt_slam_ros.topological_inference.candidate_gating import Query
 from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch, Fit, SearchState
 from hmt_slam_ros.topological_inference.global_localization import LandmarkEvidence, PoseDistribution, PoseHint
@@ -151,6 +152,7 @@ class Branching:
         self.search = ClosureSearch(configuration, scans)
         self.landmarks = None if landmarks is None else landmarks(configuration, scans)
         self.options = configuration.tsbi
+        self._filter = configuration.filter
         self._replica = replica
         sigma, angle = configuration.tlca.arc_sigma_floor, math.radians(configuration.tlca.arc_angle_floor)
         self._covariance_floor = np.diag([sigma**2, sigma**2, angle**2])
@@ -234,6 +236,8 @@ class Branching:
         """
         query = self.query(parent, keyframes)
         local_areas = parent.local_area_poses()
+        if is_wide(query.belief.covariance, self._filter):
+            local_areas = {}
         tracked = self.search.tracked_area(parent.hybrid_map, parent.area, local_areas, query.poses_in_area)
         if tracked is not None:
             return Branches([self._enter_tracked(parent, query, tracked)])
@@ -256,7 +260,7 @@ class Branching:
         own = parent.hybrid_map.keyframes(parent.area)
         keyframes = [k for k in (newest if only else parent.state.unmatched_keyframes) if k in own]
         query = self.query(parent, keyframes)
-        excluded = {parent.area, *parent.local_area_poses(), *connected_neighbors(parent.hybrid_map, parent.area)}
+        excluded = {parent.area, *parent.local_area_poses(), *self._certain_neighbors(parent)}
         if self.landmarks is not None and parent.probability >= MIN_PROPOSAL_PROBABILITY:
             self.landmarks.prepare_loops(parent.hybrid_map, parent.area)
         found = self._compare_areas(parent, query, excluded, only)
@@ -269,6 +273,12 @@ class Branching:
         stay = replace(parent.unchanged_child(), log_weight=parent.log_weight + log_new)
         children = [stay, *(self._join(parent, query, fit) for fit in found.fits)]
         return Branches(children, True, _log(found.skipped_weight) + parent.log_weight)
+
+    def _certain_neighbors(self, parent: Parent) -> set[int]:
+        """The areas that an arc joins to the robot's, but none that is too wide for one submap."""
+        neighbors = connected_neighbors(parent.hybrid_map, parent.area)
+        arcs = {area: informative_arc(parent.hybrid_map, parent.area, area) for area in neighbors}
+        return {area for area, arc in arcs.items() if arc is None or not is_wide(arc.covariance, self._filter)}
 
     def _compare_areas(
         self, parent: Parent, query: Query, excluded: Collection[int], only: Collection[int] = ()
@@ -306,7 +316,7 @@ class Branching:
         found = self.search.tracked_area(parent.hybrid_map, parent.area, around, pose[None])
         if found is None:
             return None
-        own = keyframe_positions(parent.hybrid_map, parent.area, np.zeros(3))
+        own = keyframe_positions(parent.hybrid_map, parent.area)
         other = keyframe_positions(parent.hybrid_map, found, around[found])
         return found if min_distance(pose[None, :2], other) < min_distance(pose[None, :2], own) else None
 
