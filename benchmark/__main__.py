@@ -117,7 +117,16 @@ def _measure(options: argparse.Namespace) -> list[Report]:
     changes, seeds = tuple(options.set), tuple(range(options.seeds))
     records = Records(options.runs or out / "runs", options.jobs)
     settings = Settings(
-        options.logs, seeds, changes, out, options.write_expected, runner, records, options.training, options.minutes
+        options.logs,
+        seeds,
+        changes,
+        out,
+        options.write_expected,
+        runner,
+        records,
+        options.training,
+        options.minutes,
+        options.draw,
     )
     reports = []
     for kind in _list_kinds(options):
@@ -166,6 +175,7 @@ def _make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--seeds", type=_parse_count, default=0, metavar="N", help="seeds 0 to N-1; simulated: from 1000"
     )
+    parser.add_argument("--draw", type=_parse_seed, default=0, metavar="K", help="of mutants: seeds K to K+N-1")
     parser.add_argument("--jobs", type=_parse_count, default=2, metavar="N", help="runs at the same time; 1 for speed")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report")
     parser.add_argument("--runs", type=Path, metavar="DIR", help="keeps simulated runs and starts, for later calls")
@@ -197,6 +207,13 @@ def _parse_minutes(text: str) -> float:
             f"{text} minutes are too few for two hours of the log: give {_LEAST_MINUTES:g} or more"
         )
     return minutes
+
+
+def _parse_seed(text: str) -> int:
+    seed = int(text)
+    if seed < 0:
+        raise argparse.ArgumentTypeError(f"{text} is negative: seeds begin at 0")
+    return seed
 
 
 def _parse_count(text: str) -> int:

@@ -28,6 +28,7 @@ class Settings:
     :ivar records: the same for simulated worlds.
     :ivar training: whether simulated worlds have training seeds instead of validation seeds.
     :ivar minutes: how long the nodes run in soak.
+    :ivar draw: the first seed of mutants.
     """
 
     logs: tuple[str, ...]
@@ -39,6 +40,7 @@ class Settings:
     records: Records
     training: bool = False
     minutes: float = 60.0
+    draw: int = 0
 
     @property
     def configuration(self) -> Configuration:

@@ -6,7 +6,9 @@ import sys
 
 import pytest
 
-from benchmark.mutants.measurement import Outcome, OutcomeFile, try_mutant
+from benchmark.__main__ import main
+from benchmark.mutants import measurement
+from benchmark.mutants.measurement import Outcome, OutcomeFile, survive, try_mutant
 from benchmark.mutants.mutations import (
     PACKAGE,
     Mutant,
@@ -16,7 +18,7 @@ from benchmark.mutants.mutations import (
     planted_mutants,
 )
 from benchmark.mutants.sandbox import Sandbox, changes_kernels, find_importers, reachable
-from benchmark.mutants.selection import STAGES, Trial, near_tests, plan_far, plan_near
+from benchmark.mutants.selection import STAGES, Baseline, Trial, near_tests, plan_far, plan_near
 from hmt_slam_ros.errors import HmtSlamError
 
 KERNELS = """from numba import njit
@@ -189,3 +191,32 @@ def test_without_cosmic_ray_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "cosmic_ray.ast", None)
     with pytest.raises(HmtSlamError, match=r"pip install -r requirements/mutants\.txt"):
         draw_mutants(["geometry/se2.py"], 10, 0)
+
+
+def test_another_draw_may_be_measured(monkeypatch, tmp_path):
+    seeds = []
+    monkeypatch.setattr(measurement, "draw_mutants", lambda _modules, _count, seed: seeds.append(seed) or [])
+    monkeypatch.setattr(measurement, "try_mutants", lambda mutants, _folder, _jobs: list(map(survive, mutants)))
+    main(["mutants", "--out", str(tmp_path / "first")])
+    main(["mutants", "--draw", "3", "--seeds", "2", "--out", str(tmp_path / "others")])
+    assert seeds == [0, 3, 4]
+
+
+def test_tests_run_again_without_a_mutant_where_they_or_the_package_have_changed(sandbox):
+    (sandbox.folder / "test" / "test_other.py").write_text("def test_nothing():\n    assert True\n")
+    runs, run = [], sandbox.run_tests
+    sandbox.run_tests = lambda names, timeout, **how: runs.append(list(names)) or run(names, timeout, **how)
+    names = ["test_motion.py", "test_other.py"]
+    for _ in range(2):
+        Baseline(sandbox).verify(names)
+    assert runs == [names]
+    (sandbox.folder / "test" / "test_other.py").write_text("def test_nothing():\n    assert not False\n")
+    Baseline(sandbox).verify(names)
+    assert runs[1:] == [["test_other.py"]]
+    (sandbox.folder / "hmt_slam_ros" / "motion" / "other.py").write_text("import os\n")
+    Baseline(sandbox).verify(names)
+    assert runs[2:] == [names]
+    kernels = sandbox.folder / "hmt_slam_ros" / "motion" / "kernels.py"
+    kernels.write_text(kernels.read_text().replace("0.5", "1.5"))
+    with pytest.raises(HmtSlamError, match=r"without a mutant test/test_motion\.py::test_half \(failed\)"):
+        Baseline(sandbox).verify(names)

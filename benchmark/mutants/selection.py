@@ -59,25 +59,30 @@ def longest(trial: Trial) -> float:
 
 
 class Baseline:
-    """How the test files do without a mutant; kept in the copy, for later calls."""
+    """How the test files do without a mutant; kept in the copy, for later calls.
+
+    A test that fails without a mutant would count as its killer: all run again where the package has changed.
+    """
 
     def __init__(self, sandbox: Sandbox) -> None:
         self._sandbox = sandbox
         self._path = sandbox.folder / "baseline.json"
+        self._package = _digest(*sorted((sandbox.folder / PACKAGE.name).rglob("*.py")))
         self._known: dict[str, bool] = json.loads(self._path.read_text()) if self._path.exists() else {}
 
     def verify(self, names: Sequence[str]) -> None:
-        """Run the test files that are new or have changed, which also compiles and caches kernels.
+        """Run the test files that are new or have changed, or all for another package; this also caches kernels.
 
         :raises HmtSlamError: where a test fails.
         """
-        new = [name for name in names if self._key(name, "compiled") not in self._known]
+        keys = {name: f"{self._key(name, 'compiled')} {self._package}" for name in names}
+        new = [name for name in names if keys[name] not in self._known]
         if not new:
             return
         run = self._sandbox.run_tests(new, _COMPILATION + 10.0 * _PER_FILE * len(new))
         if run.status != "passed":
             raise HmtSlamError(f"without a mutant {run.failed or run.output} ({run.status}): mend it first")
-        self._note(dict.fromkeys((self._key(name, "compiled") for name in new), True))
+        self._note(dict.fromkeys((keys[name] for name in new), True))
 
     def is_interpretable(self, name: str) -> bool:
         """Whether a test file passes without compilation, and soon enough."""
@@ -88,12 +93,15 @@ class Baseline:
         return self._known[key]
 
     def _key(self, name: str, way: str) -> str:
-        content = (self._sandbox.folder / "test" / name).read_bytes()
-        return f"{name} {hashlib.sha256(content).hexdigest()[:12]} {way}"
+        return f"{name} {_digest(self._sandbox.folder / 'test' / name)} {way}"
 
     def _note(self, results: dict[str, bool]) -> None:
         self._known |= results
         self._path.write_text(json.dumps(self._known, indent=1))
+
+
+def _digest(*paths: Path) -> str:
+    return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()[:12]
 
 
 def plan_near(mutant: Mutant, baseline: Baseline) -> Trial:
