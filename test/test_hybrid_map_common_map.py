@@ -5,7 +5,7 @@ import pytest
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
-from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, CommonMap, HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, CommonMap, GraphState, HybridMap
 
 
 def arc(x):
@@ -151,3 +151,13 @@ def test_the_number_of_an_area_that_is_no_more_is_not_used_again():
     hybrid_map.merge(3, 0, hybrid_map.arc(0, 3))
     assert hybrid_map.area_ids() == [0, 1, 2]
     assert hybrid_map.max_area_id == 3
+
+
+def test_a_removed_arc_is_a_row_of_zeros_that_says_so():
+    pose, covariance = np.array([1.0, 2.0, 0.3]), np.diag([0.1, 0.2, 0.3])
+    arcs = {(1, 4): ArcValue(PoseGaussian(pose, covariance), closure=True), (2, 3): None}
+    state = GraphState.from_areas_and_arcs({}, arcs)
+    assert (state.closures.tolist(), state.removed.tolist()) == ([True, False], [False, True])
+    np.testing.assert_array_equal(state.means, [pose, np.zeros(3)])
+    np.testing.assert_array_equal(state.covariances, [covariance, np.zeros((3, 3))])
+    assert state.arcs.tolist() == [[1, 4], [2, 3]]

@@ -1,11 +1,14 @@
 """The pose graph against closed forms, a dense reference, and the statistics of simulated graphs."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, fuse
+from hmt_slam_ros.hybrid_map import pose_graph
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import (
     Edges,
@@ -176,6 +179,44 @@ def test_a_bad_start_is_damped_to_the_same_solution():
     np.testing.assert_allclose(optimize(bad, graph).poses, good.poses, atol=1e-6)
 
 
+class GivenCosts:
+    """The normal equations of a problem whose costs are given, one after the other; notes the damping of every step."""
+
+    def __init__(self, costs):
+        self.costs, self.dampings = list(costs), []
+
+    def evaluate(self, _poses):
+        return SimpleNamespace(cost=self.costs.pop(0), chi2=np.zeros(1))
+
+    def step(self, _state, damping):
+        self.dampings.append(damping)
+        return np.full((2, 3), 0.1)
+
+
+@pytest.mark.parametrize(
+    ("costs", "dampings"),
+    [
+        ([9.0, 10.0, np.nan, 12.0, 8.0, 7.0, 6.0, 5.0, 4.0, 4.0], [0.0, 1e-6, 1e-5, 1e-4, 1e-5, 1e-6, 0.0, 0.0, 0.0]),
+        ([9.0, 10.0, 8.0, 11.0, 11.0, 7.0, 7.0], [0.0, 1e-6, 0.0, 1e-6, 1e-5, 1e-6]),
+        ([9.0, *[10.0] * 16], [0.0, *(10.0**n for n in range(-6, 9))]),
+    ],
+)
+def test_damping_grows_tenfold_with_every_step_that_fails_and_falls_with_every_other(monkeypatch, costs, dampings):
+    given = GivenCosts(costs)
+    monkeypatch.setattr(pose_graph, "_System", lambda *_: given)
+    found = optimize(np.zeros((2, 3)), None, marginals=False)
+    assert given.dampings == pytest.approx(dampings)
+    falling = [cost for n, cost in enumerate(costs) if n and cost <= min(costs[:n])]
+    assert (found.steps, found.chi2) == (len(falling), min(costs))
+
+
+@pytest.mark.parametrize(("last", "steps"), [(6.93, 1), (6.91, 2)])
+def test_a_step_that_lowers_the_cost_by_a_share_of_what_is_left_at_most_is_the_last(monkeypatch, last, steps):
+    given = GivenCosts([9.0, last, 6.0, 6.0, 6.0])
+    monkeypatch.setattr(pose_graph, "_System", lambda *_: given)
+    assert optimize(np.zeros((2, 3)), None, marginals=False, tolerance=0.3).steps == steps
+
+
 def test_errors_of_simulated_graphs_are_as_large_as_the_marginals_say():
     # NEES of one node over independent graphs: chi-square with 3 degrees of freedom each.
     nees = []
@@ -248,6 +289,11 @@ def test_closing_the_ring_makes_the_areas_more_certain():
     for area in (5, 8, 9):
         loose, tight = shortest.poses[area].covariance, consistent.poses[area].covariance
         assert np.linalg.det(tight) < 0.9 * np.linalg.det(loose)
+
+
+def test_the_first_area_lies_at_the_origin_of_a_map_that_is_empty_yet():
+    for found in (consistent_map(HybridMap()), shortest_path_map(HybridMap())):
+        assert list(found.poses) == [0]
 
 
 def test_one_area_without_arcs_lies_at_the_origin():

@@ -6,7 +6,7 @@ import pytest
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
+from hmt_slam_ros.hybrid_map.shortest_path import connected_areas, shortest_path_beliefs
 
 
 def arc(x, y, theta, sigma_xy=0.1, sigma_theta=0.0):
@@ -161,3 +161,11 @@ def test_an_arc_that_a_hypothesis_lacks_is_not_followed():
             np.testing.assert_array_equal(found[area].covariance, belief.covariance)
     hypothesis.commit()
     assert list(shortest_path_beliefs(hypothesis, 0)) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("deviations", "last"), [((20.0, 90.0), 2), ((150.0, 149.0), 2), ((150.0, 151.0), 1)])
+def test_areas_are_connected_up_to_a_variance_of_300_m_squared(deviations, last):
+    hybrid_map = chain(*(arc(4.0, 1.0, 0.2, each) for each in deviations))
+    for area in range(3):
+        hybrid_map.set_keyframe(area, area, np.zeros(3))
+    assert list(connected_areas(hybrid_map, 0)) == list(range(last + 1))

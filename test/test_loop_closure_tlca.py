@@ -54,6 +54,15 @@ def test_a_dominant_path_is_accepted_after_enough_meters_since_the_paths_parted(
     assert [play.step(*both(), travelled=t).hypothesis for t in (1.0, 2.4, 2.5)] == [None, None, 1]
 
 
+def test_the_first_hypothesis_has_its_meters_from_the_start():
+    play = Play(accept_keyframes=1, accept_distance=2.0)
+    play.start()
+    hypotheses = Hypothesis(0, 0, 0.95, 0), Hypothesis(2, 0, 0.05, 0)
+    assert play.step(*hypotheses, travelled=1.5).hypothesis is None
+    both = Hypothesis(0, 0, 0.95, 0), Hypothesis(2, 2, 0.05, 0)
+    assert [play.step(*both, travelled=t).hypothesis for t in (1.9, 2.0)] == [None, 0]
+
+
 def test_keyframes_count_only_in_a_row():
     play = Play(accept_distance=0.0)
     branch(play)

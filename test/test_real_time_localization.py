@@ -14,6 +14,7 @@ from hmt_slam_ros.messages.map_changes import AreaPose
 from hmt_slam_ros.messages.messages import ClosureDecision, LocalEstimate, Notice
 from hmt_slam_ros.real_time_localization.rtl import CorrectionSmoother, Rtl
 from hmt_slam_ros.sensors import Odometry
+from hmt_slam_ros.sensors.relative_motion import path_covariance
 
 SECOND = 1_000_000_000
 
@@ -138,6 +139,21 @@ def test_the_map_pose_has_the_ambiguity_of_the_newest_decision(rtl):
         np.testing.assert_allclose(answer(seconds) - alone, ambiguity, atol=1e-12)
 
 
+def test_the_uncertainty_is_that_of_the_path_and_the_turns_since_the_estimate(rtl):
+    path = [(0.0, 0.0, 0.0), (0.4, 0.1, 0.3), (0.7, 0.3, 0.1), (1.1, 0.2, -0.2), (1.3, 0.5, 0.1), (1.6, 0.6, 0.25)]
+    for k, pose in enumerate(path[:4]):
+        rtl.handle(odometry(float(k), *pose))
+    rtl.handle(estimate(2.0, (3.0, 2.0, 1.0), path[2]))
+    steps = se2.between(np.array(path[:-1]), np.array(path[1:]))
+    for k in (4, 5):
+        (answer,) = rtl.handle(odometry(float(k), *path[k]))
+        distance, angle = np.hypot(*steps[2:k, :2].T).sum(), np.abs(steps[2:k, 2]).sum()
+        since = PoseGaussian(se2.between(path[2], path[k]), path_covariance(distance, angle, Configuration().motion))
+        expected = PoseGaussian(np.array([3.0, 2.0, 1.0]), 1e-4 * np.eye(3)).compose(since)
+        np.testing.assert_allclose(answer.pose_in_area.mean, expected.mean)
+        np.testing.assert_allclose(answer.pose_in_area.covariance, expected.covariance)
+
+
 def test_driving_to_and_fro_does_not_make_the_robot_sure_again(rtl):
     rtl.handle(odometry(0, 0, 0, 0))
     rtl.handle(estimate(0, (0, 0, 0), (0, 0, 0)))
@@ -175,6 +191,41 @@ def test_a_correction_decays_exponentially():
         found = smoother.smooth(round(seconds * SECOND), after, here, 2.0)
         np.testing.assert_allclose(found, (1.0 - math.exp(-seconds / 2.0)) * after, atol=1e-9)
     np.testing.assert_allclose(smoother.smooth(4 * SECOND, before, here, 0.0), before)
+
+
+@pytest.mark.parametrize(
+    ("correction", "is_shown_at_once"),
+    [
+        ((2.0, 0.0, 0.0), False),
+        ((0.0, -2.0, 0.0), False),
+        ((0.0, 2.0001, 0.0), True),
+        ((1.5, -1.5, 0.0), True),
+        ((0.0, 0.0, math.radians(45.0)), False),
+        ((0.0, 0.0, math.radians(45.001)), True),
+        ((0.0, 0.0, -math.radians(45.001)), True),
+        ((0.7, -0.5, -math.radians(44.0)), False),
+    ],
+)
+def test_a_correction_beyond_two_meters_or_an_eighth_of_a_turn_is_shown_at_once(correction, is_shown_at_once):
+    """At the origin, so that the remaining correction is exact; of a turn it is the twist."""
+    smoother, target = CorrectionSmoother(), np.zeros(3)
+    before = se2.exp(np.array(correction))
+    smoother.smooth(0, before, np.zeros(3), 2.0)
+    found = smoother.smooth(SECOND, target, np.zeros(3), 2.0)
+    expected = np.zeros(3) if is_shown_at_once else se2.exp(math.exp(-0.5) * np.array(correction))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_a_correction_is_smoothed_where_the_robot_is_and_not_at_the_origin_of_odometry():
+    smoother, here = CorrectionSmoother(), np.array([40.0, -30.0, 2.0])
+    before, after = np.array([1.0, 2.0, 0.3]), np.array([1.5, 1.8, 0.31])
+    smoother.smooth(3 * SECOND, before, here, 4.0)
+    found = smoother.smooth(5 * SECOND, after, here, 4.0)
+    at, target = se2.compose(before, here), se2.compose(after, here)
+    expected = se2.compose(target, se2.exp(math.exp(-0.5) * se2.log(se2.between(target, at))))
+    np.testing.assert_allclose(se2.compose(found, here), expected, atol=1e-9)
+    # A log that begins again has no correction that remains.
+    np.testing.assert_array_equal(smoother.smooth(4 * SECOND, before, here, 4.0), before)
 
 
 def test_an_estimate_from_before_a_reset_still_serves(rtl):

@@ -11,7 +11,7 @@ from worlds import box, drive, scan_in, two_rooms
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import write_to_array
 from hmt_slam_ros.grids.patches import FAR, PATCH, field_at, odds_at
-from hmt_slam_ros.registration.dynamic_rejection import reject_dynamic
+from hmt_slam_ros.registration.dynamic_rejection import _segment_starts, reject_dynamic
 from hmt_slam_ros.registration.match_covariance import MatchNoise, estimate_match_error
 from hmt_slam_ros.registration.scan_to_map import (
     AlignmentSettings,
@@ -357,6 +357,38 @@ def test_alignment_ends_where_the_gradient_of_points_and_prior_is_zero(room, off
     step = np.linalg.solve(found / 4.0 + prior.information, total)
     assert np.abs(step).max() < 2e-3
     np.testing.assert_allclose(information, found, rtol=0.2, atol=0.1 * np.abs(found).max())
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_alignment_goes_on_while_a_single_number_of_the_pose_still_changes(room, axis):
+    """The information of the prior leaves one number free."""
+    points, truth = scan_surfels(ROOM, (0.5, -0.4, 0.0), beams=181), np.array([0.5, -0.4, 0.0])
+    start = truth - 0.25 * np.eye(3)[axis]
+    prior = Prior(start, np.diag(np.where(np.arange(3) == axis, 1e-6, 1e12)))
+
+    def remaining_step(iterations):
+        pose, _ = align(points, start, prior, room, ALIGNMENT._replace(iterations=iterations))
+        assert np.abs(np.delete(pose - start, axis)).max() < 1e-4
+        sums, gradient, _ = linearize(points, *pose, room, ALIGNMENT)
+        information = np.empty((3, 3))
+        write_to_array(sums, information)
+        return abs(gradient[axis] / information[axis, axis])
+
+    assert remaining_step(30) < 5e-5
+    assert remaining_step(1) > 4e-4
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.2])
+def test_segments_begin_behind_gaps_of_a_tenth_of_a_meter_and_a_twentieth_of_the_range(turn):
+    random = np.random.default_rng(5)
+    ranges = np.concatenate([random.uniform(1.0, 9.0) + random.normal(0.0, 0.05, 7) for _ in range(12)])
+    angles = np.linspace(-1.5, 1.5, len(ranges)) + turn
+    points = np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles), np.zeros((len(ranges), 2))))
+    expected = [int(own[0]) for own in segments_of(points)]
+    assert len(expected) > 8
+    assert _segment_starts(points).tolist() == [*expected, len(points)]
+    assert _segment_starts(points[:1]).tolist() == [0, 1]
+    assert _segment_starts(points[:0]).tolist() == [0]
 
 
 def test_tables_of_the_beam_model_are_a_normal_around_surfaces_beside_random_returns():

@@ -7,7 +7,7 @@ import pytest
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid, thin_points
+from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid, surface_points, thin_points
 
 ROOM = box(0.0, 0.0, 6.0, 4.0)
 MODEL = GridModel()
@@ -50,6 +50,14 @@ def test_points_beyond_the_range_are_not_used():
     pose = np.array([2.0, 2.0, 0.0])
     grid = build_area_grid([scan_in(ROOM, pose, field_of_view=2 * np.pi, beams=721)], pose[None], near)
     assert np.hypot(*(grid.points - pose[:2]).T).max() <= 2.5
+
+
+def test_the_surface_points_of_a_scan_are_its_ends_within_the_range_one_a_voxel(room):
+    scan = scan_in(box(-2.0, -1.5, 9.0, 4.0), (0.3, 0.2, 0.4), beams=721)
+    model = GridModel(max_range=5.0)
+    near = scan.points[np.hypot(*(scan.points - scan.laser_pose[:2]).T) <= 5.0]
+    assert len(near) < len(scan.points)
+    np.testing.assert_allclose(surface_points(scan, model), thin_points(near, model.spacing))
 
 
 def test_poses_place_the_scans():

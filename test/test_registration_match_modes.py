@@ -115,6 +115,17 @@ def test_the_peak_is_no_lower_than_all_its_neighbors(surface, samples, start):
     assert height(peak) > height(np.array(start)) + 0.01
 
 
+@pytest.mark.parametrize("each", [each for each in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(each)])
+def test_the_first_step_leads_to_whichever_neighbor_is_highest(each):
+    """A prior alone, which is wide along one direction: a step in any other one leads down."""
+    flat, step = LogRatioGrid(np.zeros((5, 5), np.float32), ORIGIN, CELL), np.array([0.02, 0.03, 0.04])
+    start = np.array([0.3, -0.2, -0.04 * each[2]])
+    covariance = np.diag(step) @ (0.02 * np.eye(3) + 4.0 * np.outer(each, each)) @ np.diag(step)
+    window = make_search_window(start + step * each, covariance, CELL, 0.05, 1e6)
+    peak = match_modes.climb_to_peak(flat, np.zeros((1, 2)), window, TEMPER, start, step, 1.0)
+    np.testing.assert_allclose(peak, window.mean, atol=1e-12)
+
+
 @pytest.mark.parametrize("pose", [(0.2, -0.1, 0.4), (0.0, 0.3, -2.0)])
 def test_the_curvature_is_that_of_finite_differences_along_the_manifold(surface, samples, pose):
     step = np.array([0.03, 0.04, 0.05])

@@ -5,12 +5,17 @@ import math
 
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter
 from test_registration_branch_and_bound import brute_force
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.registration.branch_and_bound import (
+    _push_quarters,
+    _SearchProblem,
+    build_constraint_pyramid,
     constrain_around,
     gather_block_points,
+    is_admissible,
     make_reverse_check,
     search_cells,
     sum_contradictions,
@@ -42,7 +47,8 @@ def test_a_constraint_admits_the_cells_within_the_radius_of_a_position_anywhere_
 def test_the_lattice_is_the_gate_within_bounds(mean):
     covariance = np.array([[0.09, 0.02, 0.0], [0.02, 0.04, 0.0], [0.0, 0.0, 0.01]])
     bounds = np.array(mean)[:2] + np.array([[-0.33, -9.0], [9.0, 0.17]])
-    free, inside = (make_search_window(np.array(mean), covariance, 0.1, 0.05, 9.0, b) for b in (None, bounds))
+    with np.errstate(all="raise"):
+        free, inside = (make_search_window(np.array(mean), covariance, 0.1, 0.05, 9.0, b) for b in (None, bounds))
     turn = np.array([[np.cos(mean[2]), -np.sin(mean[2])], [np.sin(mean[2]), np.cos(mean[2])]])
     half = 3.0 * np.sqrt(np.diag(turn @ covariance[:2, :2] @ turn.T)) / 0.1
     np.testing.assert_array_equal(free.last, np.ceil(half))
@@ -57,6 +63,8 @@ def test_a_pyramid_has_the_largest_log_ratios_of_squares_in_steps(height):
     pyramid = build_pyramid(log_ratio, height)
     assert pyramid.step == pytest.approx(log_ratio.max() / 64.0)
     wide = np.pad(log_ratio, pyramid.margin)
+    assert pyramid.margin == 2**height
+    assert pyramid.levels.shape == (height + 1, *wide.shape)
     for level, side in enumerate(2 ** np.arange(height + 1)):
         for y, x in itertools.product(range(pyramid.margin + 13), range(pyramid.margin + 18)):
             steps = wide[y : y + side, x : x + side].max() / pyramid.step
@@ -82,6 +90,11 @@ def test_the_bound_of_the_prior_is_no_less_than_its_exponent_and_equal_for_a_sin
         inside = [exponent(k, i + x, j + y) for x, y in itertools.product(range(4), repeat=2)]
         bound = prior_bound(window, k, i, j, 4)
         assert bound >= max(each if each >= -4.5 else -np.inf for each in inside) - 1e-9
+        # By the triangle inequality: from the middle of the square to its corner that changes the exponent most.
+        middle = window.whitening[k] @ (0.1 * (np.array([i, j]) + 1.5)) + window.offsets[k]
+        corner = max(np.linalg.norm(window.whitening[k] @ (0.15 * np.array([1.0, side]))) for side in (-1.0, 1.0))
+        nearest = max(0.0, np.linalg.norm(middle) - corner)
+        assert bound == pytest.approx(-0.5 * nearest**2 if nearest**2 <= 9.0 else -np.inf)
     # The lattice holds the whole gate and hardly more.
     draws = np.random.default_rng(9).normal(size=(4000, 3))
     draws *= 3.0 / np.linalg.norm(draws, axis=1)[:, None]
@@ -123,6 +136,16 @@ def test_a_block_has_all_points_that_contradict_in_one_of_its_cells_and_not_many
     assert farthest + 1.0 <= check.reach < farthest + 2.0
 
 
+@pytest.mark.parametrize("ratio", [0.4, 1.0, 2.7])
+def test_cells_near_a_contradiction_are_marked_as_far_as_points_may_lie_off_the_middle(ratio):
+    log_ratio = np.where(np.random.default_rng(6).random((7, 12)) < 0.04, -0.5, 0.3).astype(np.float32)
+    log_ratio[0, -1], log_ratio[-1, 0] = -1e-3, 0.0
+    window = make_search_window(np.array([0.2, -0.1, 0.4]), np.diag([0.2, 0.2, 0.1]) ** 2, 0.1, 0.08, 9.0)
+    check = make_reverse_check(window, LogRatioGrid(log_ratio, np.zeros(2), 0.1 / ratio), np.zeros((0, 2)))
+    near = maximum_filter(np.pad(log_ratio < 0.0, check.reach), 2 * check.reach + 1, mode="constant")
+    np.testing.assert_array_equal(check.negative, near)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_sums_over_samples_are_those_of_the_cells_where_they_lie(seed):
     rng = np.random.default_rng(seed)
@@ -147,7 +170,41 @@ def test_sums_over_samples_are_those_of_the_cells_where_they_lie(seed):
             assert four[0] == (bounds[0][own[1], own[0]] if (own >= 0).all() and (own < (44, 36)).all() else 0)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
+def test_of_a_square_the_quarters_are_searched_that_may_hold_a_cell_the_best_first(seed):
+    rng = np.random.default_rng(seed)
+    surface = LogRatioGrid(rng.normal(size=(30, 34)).astype(np.float32), rng.uniform(-2.0, -1.5, 2), 0.1)
+    samples, far = rng.uniform(-0.5, 0.5, (1, 2)), np.array([[-9.0, -0.4], [0.3, 9.0]])
+    limits = far if seed % 2 else far[:, ::-1]
+    window = make_search_window(rng.uniform(-0.3, 0.3, 3), np.diag([0.4, 0.4, 0.1]) ** 2, 0.1, 0.08, 9.0, limits)
+    reverse = make_reverse_check(window, surface, np.zeros((0, 2)))
+    constraint = build_constraint_pyramid(
+        constrain_around(rng.uniform(-1.0, 1.0, (3, 2)), rng.uniform(-1.0, 1.0, (2, 2)), 0.3, 0.1), window, 3
+    )
+    pyramid, cells = build_pyramid(surface.log_ratio, 3), sample_cells(window, surface, samples)
+    problem = _SearchProblem(window, surface, pyramid, cells, constraint, reverse, 0.5, 2.0)
+    pushed = []
+    for k, i, j in rng.integers([0, *window.first], [window.turns.size, *window.last + 1], (80, 3)).tolist():
+        height = 1 + (i + j) % 2
+        side, least = 2**height, rng.uniform(-3.0, 0.0)
+        expected = {}
+        for x, y in itertools.product((i, i + side), (j, j + side)):
+            forward = 0.5 * pyramid.step * square_bound(pyramid.levels[height], pyramid.margin, cells[k], x, y)
+            bound = forward + prior_bound(window, k, x, y, side)
+            within = x <= window.last[0] and y <= window.last[1] and is_admissible(constraint, height, k, x, y)
+            if within and min(forward, bound) >= least:
+                expected[k, x, y, height] = bound
+        stack, bounds = np.full((7, 4), -9), np.full(7, 5.0)
+        size = _push_quarters(problem, stack, bounds, 2, (k, i, j), height, least)
+        found = dict(zip(map(tuple, stack[2:size].tolist()), bounds[2:size], strict=True))
+        assert found == pytest.approx(expected)
+        assert bounds[2:size].tolist() == sorted(bounds[2:size])
+        assert (stack[:2] == -9).all()
+        pushed.append(len(found))
+    assert set(pushed) >= {0, 1, 2}
+
+
+@pytest.mark.parametrize("seed", range(8))
 def test_the_search_for_one_sample_finds_the_cells_that_brute_force_finds(seed):
     """A single one, since interpreted sums of int8 overflow; all of the search is the same for many."""
     rng = np.random.default_rng(seed)
@@ -156,13 +213,16 @@ def test_the_search_for_one_sample_finds_the_cells_that_brute_force_finds(seed):
         for cell in (0.1, 0.13)
     )
     samples, back_samples = rng.uniform(-0.5, 0.5, (1, 2)), rng.uniform(-1.5, 1.5, (12, 2))
-    spread = np.diag([0.35, 0.3, 0.05]) ** 2 + 0.002
-    window = make_search_window(rng.uniform(-0.3, 0.3, 3), spread, 0.1, 0.08, 9.0)
+    # Wide, or high and cut off on one side.
+    spread, bounds = np.diag([0.35, 0.2, 0.05]) ** 2 + 0.002, None
+    if seed % 2:
+        spread, bounds = np.diag([0.15, 0.4, 0.05]) ** 2 + 0.002, np.array([[-9.0, -0.4], [0.3, 9.0]])
+    window = make_search_window(rng.uniform(-0.3, 0.3, 3), spread, 0.1, 0.08, 9.0, bounds)
     expected = brute_force(window, surface, samples, back, back_samples, 0.5)
     best = max(expected.values())
     expected = {cell: score for cell, score in expected.items() if score >= best - 2.0}
     found = search_cells(window, surface, samples, back, back_samples, 0.5, -100.0, 2.0)
     scores = {tuple(cell): score for cell, score in zip(found.indices.tolist(), found.score, strict=True)}
-    assert len(expected) > 20
+    assert len(expected) > 10
     assert scores.keys() == expected.keys()
     assert scores == pytest.approx(expected, abs=1e-5)

@@ -129,6 +129,7 @@ def test_candidates_beyond_the_number_that_is_examined_keep_their_prior_mass():
 def test_a_re_check_joins_areas_by_an_arc_and_moves_nothing():
     parent, branching, _ = rooms_apart((ROOM, ROOM, ROOM), ((0.6, 0.4), (-0.5, 0.3)), 1.0)
     known_through_another(parent.hybrid_map)
+    parent.hybrid_map.set_arc(2, 1, PoseGaussian(parent.hybrid_map.arc(2, 1).mean, 1e-3 * np.eye(3)), closure=False)
     children = branching.recheck(parent).children
     stay, *joined = children
     assert (stay.area, stay.arcs, stay.reload_local_map) == (2, (), False)
@@ -161,6 +162,28 @@ def test_keyframes_beside_the_place_of_an_area_make_it_a_pending_candidate():
     branches = branching.cut(parent, newest)
     assert [child.area for child in branches.children] == [parent.area + 1]
     assert 0 not in branches.children[0].state.matched_keyframes
+
+
+@pytest.mark.parametrize(("sigma", "is_compared"), [(1.0, True), (0.05, False)])
+def test_a_recheck_compares_a_neighbor_only_where_the_arc_is_wide(sigma, is_compared):
+    parent, branching, _ = rooms_apart((ROOM, ROOM), ((0.6, -0.4),), sigma)
+    parent = replace(parent, state=replace(parent.state, local_area_poses={}))
+    stay, *joined = branching.recheck(parent).children
+    assert [[arc.target for arc in child.arcs] for child in joined] == [[0]] * is_compared
+    for child in joined:
+        assert child.log_weight > stay.log_weight
+        np.testing.assert_allclose(child.arcs[0].pose.mean, np.zeros(3), atol=0.03)
+
+
+def test_keyframes_of_a_wide_pose_are_tracked_in_no_area_and_compared_with_those_around():
+    parent, branching, newest = rooms_apart((ROOM, ROOM), ((0.6, -0.4),), 1.0)
+    poses = {0: np.array([0.6, -0.4, 0.0])}
+    certain = replace(parent, state=replace(parent.state, local_area_poses=poses))
+    (tracked,) = branching.cut(certain, newest).children
+    assert tracked.area == 0
+    wide = {k: np.diag([0.6, 0.6, 0.2]) ** 2 for k in newest}
+    uncertain = replace(certain, state=replace(certain.state, covariances=wide))
+    assert {child.area for child in branching.cut(uncertain, newest).children} == {0, parent.area + 1}
 
 
 def test_a_recheck_of_pending_candidates_compares_the_newest_keyframes():

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.registration.area_to_area import MatchMode
@@ -117,6 +118,52 @@ def test_walls_that_beams_pass_count_against_a_candidate_and_others_count_for_no
     first, second, third = found.probabilities
     assert second / first == pytest.approx(math.exp(log_ratio))
     assert third == pytest.approx(first)
+
+
+@pytest.mark.parametrize("reach", [-0.01, 0.01])
+@pytest.mark.parametrize("turn", [0.3, 2.0])
+def test_an_initial_pose_reaches_four_deviations_of_its_least_certain_direction(turn, reach):
+    """From a keyframe amid area 1, whose other keyframe is farther away, in whatever direction it lies."""
+    hybrid_map, rotation = HybridMap(), se2.adjoint([0.0, 0.0, turn])
+    hybrid_map.set_keyframe(0, 0, np.array([50.0, 0.0, 0.0]))
+    hybrid_map.set_keyframe(1, 1, np.array([20.0, 1.0, 0.0]))
+    hybrid_map.set_keyframe(2, 1, np.array([1.0, -0.5, 0.3]))
+    hybrid_map.set_keyframe(8, 2, np.zeros(3))
+    arc = np.array([3.0, 7.0, 1.2])
+    for area in (1, 2):
+        hybrid_map.set_arc(0, area, PoseGaussian(arc, 1e-4 * np.eye(3)), closure=False)
+    covariance = rotation @ np.diag([0.1, 0.6, 0.2]) ** 2 @ rotation.T
+    at = se2.transform(arc, [1.0, -0.5]) + (1.5 + 4.0 * 0.6 - reach) * np.array([0.6, -0.8])
+    pose_hint = PoseHint(9, 0, PoseGaussian(np.array([*at, 0.4]), covariance))
+    matcher = GivenWalls(dict.fromkeys(range(3), Agreement(0, 0, 0)))
+    # The keyframe of area 2 came when the robot was lost already.
+    areas = dict.fromkeys(range(3), 1.0 / 3.0)
+    localize_globally(matcher, areas, 0.01, hybrid_map, {9: np.zeros(3)}, 8, NO_CLUTTER, pose_hint, 1.5)
+    assert matcher.searched == ([1] if reach > 0.0 else [])
+
+
+def test_an_initial_pose_weighs_candidates_by_their_distance_in_both_covariances():
+    hybrid_map = HybridMap()
+    for area in (0, 1):
+        hybrid_map.set_keyframe(area, area, np.zeros(3))
+    arc = PoseGaussian(np.array([1.0, 0.5, 0.9]), np.diag([0.02, 0.01, 0.004]))
+    hybrid_map.set_arc(0, 1, arc, closure=False)
+    hint = PoseGaussian(np.array([0.4, 0.9, 0.5]), np.array([[0.3, 0.1, 0.0], [0.1, 0.2, 0.02], [0.0, 0.02, 0.1]]))
+    matcher = GivenWalls(dict.fromkeys(range(2), Agreement(0, 0, 0)))
+    areas = dict.fromkeys(range(2), 0.5)
+    search = (matcher, areas, 0.01, hybrid_map, {9: np.zeros(3)}, 9, NO_CLUTTER)
+    flat, found = (
+        localize_globally(*search, pose_hint, 2.0).probabilities for pose_hint in (None, PoseHint(9, 0, hint))
+    )
+    measured = make_candidate(0).mode.measured
+    odds = []
+    for belief in (PoseGaussian(np.zeros(3), np.zeros((3, 3))), arc):
+        ad = se2.adjoint(se2.inverse(measured.mean))
+        pose, covariance = se2.compose(belief.mean, measured.mean), ad @ belief.covariance @ ad.T + measured.covariance
+        off = se2.log(se2.between(hint.mean, pose))
+        odds.append(math.exp(-0.5 * off @ np.linalg.inv(covariance + hint.covariance) @ off))
+    # The flat prior gives each of the two areas a half.
+    np.testing.assert_allclose(found / (1.0 - found.sum()), 2.0 * np.array(odds) * flat / (1.0 - flat.sum()))
 
 
 @pytest.mark.parametrize(("x", "y", "near"), [(0.0, 8.0, [1]), (8.0, 0.0, [2]), (0.5, 0.5, [0]), (4.5, 4.5, [])])

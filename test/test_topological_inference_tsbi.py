@@ -275,5 +275,7 @@ def test_the_local_map_takes_the_poses_of_the_global_map_where_they_agree():
 def test_events_of_another_keyframe_are_refused():
     run = Run(RING)
     run.keyframe(np.array([3.0, 1.0, 0.0]))
-    with pytest.raises(HmtSlamError, match="a message was lost"):
+    with pytest.raises(HmtSlamError, match="area events 5 came, but the last keyframe is 0: a message was lost"):
         run.tsbi.handle(AreaEvents(5, ()))
+    with pytest.raises(HmtSlamError, match="area events 0 came, but the last keyframe is none: a message was lost"):
+        Run(RING).tsbi.handle(AreaEvents(0, ()))

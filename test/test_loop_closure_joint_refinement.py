@@ -1,0 +1,143 @@
+"""Equations of the joint refinement: registrations as edges, the information that counts, and distant pairs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import drive, scan_in, two_rooms
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.hybrid_map.pose_graph import Edges, relative_covariances
+from hmt_slam_ros.loop_closure import joint_refinement
+from hmt_slam_ros.loop_closure.joint_refinement import (
+    ScanPairs,
+    add_distant_pairs,
+    nearest_keyframes,
+    relative_beliefs,
+    scan_pairs,
+)
+from hmt_slam_ros.registration.scan_to_scan import extract_surfaces, normal_equations, weighting_from_options
+
+OPTIONS = replace(Configuration().refinement, certainty=0.4)
+POSES = np.concatenate((drive((1.0, 2.0), (4.0, 3.0))[:3], drive((6.5, 3.0), (9.0, 3.5))[:2]))
+PAIRS = ScanPairs(np.array([[0, 1], [0, 2], [1, 2], [3, 4], [0, 4]]), np.array([0.1, 0.1, 0.1, 0.1, 0.99]))
+MOTION = Edges(
+    np.arange(4),
+    np.arange(1, 5),
+    se2.between(POSES[:-1], POSES[1:]),
+    np.tile(np.diag([0.1, 0.08, 0.03]) ** 2, (4, 1, 1)),
+)
+
+
+@pytest.fixture(scope="module")
+def surfaces():
+    scans = [scan_in(two_rooms(), pose, beams=121, noise=0.01, seed=k) for k, pose in enumerate(POSES)]
+    return extract_surfaces(scans, 30.0, 60)
+
+
+def plain_registrations(surfaces, poses, gate, stride):
+    """{pair: the step of Gauss-Newton with a weak prior, and the information}, of those that overlap."""
+    found = {}
+    for (i, j), least in zip(PAIRS.rows, PAIRS.min_share, strict=True):
+        relative = se2.between(poses[j], poses[i])
+        rows = np.array([i]), np.array([j])
+        information, gradient, share = normal_equations(
+            surfaces, rows[0], surfaces, rows[1], relative[None], gate, weighting_from_options(OPTIONS), stride
+        )
+        if share[0] >= least:
+            total = information[0] + 0.1 * np.eye(3)
+            found[i, j] = se2.compose(relative, se2.exp(-np.linalg.inv(total) @ gradient[0])), total
+    return found
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_pairs_that_overlap_become_edges_from_the_second_to_the_first(surfaces, stride):
+    poses = se2.compose(POSES, se2.exp(np.random.default_rng(2).normal(0.0, 0.02, (5, 3))))
+    edges = joint_refinement._register_pairs(surfaces, poses, PAIRS, 0.3, stride, OPTIONS)
+    expected = plain_registrations(surfaces, poses, 0.3, stride)
+    assert list(zip(edges.targets, edges.sources, strict=True)) == list(expected)
+    assert (0, 4) not in expected
+    assert len(expected) >= 3
+    for pose, covariance, (step, information) in zip(edges.poses, edges.covariances, expected.values(), strict=True):
+        np.testing.assert_allclose(pose, step, atol=1e-9)
+        np.testing.assert_allclose(covariance @ information, np.eye(3), atol=1e-8)
+
+
+def test_directions_with_next_to_no_information_are_dropped():
+    rng = np.random.default_rng(3)
+    scale = np.diag([1.0, 1.0, 3.0])
+    for values, kept in (((5.0, 1.0, 0.021), 3), ((5.0, 1.0, 0.019), 2), ((5.0, 0.019, 0.01), 1)):
+        vectors = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        # A turn counts as it moves a point three meters away.
+        whole, part = (scale @ (vectors[:, :n] * values[:n]) @ vectors[:, :n].T @ scale for n in (3, kept))
+        np.testing.assert_allclose(joint_refinement._drop_weak_directions(whole[None])[0], part, atol=1e-9)
+
+
+def test_relative_poses_are_as_certain_as_motion_and_a_share_of_what_walls_tell(surfaces):
+    between = np.array([[0, 2], [4, 1], [3, 4]])
+    found = relative_beliefs(surfaces, POSES, PAIRS, MOTION, OPTIONS, between)
+    expected = plain_registrations(surfaces, POSES, OPTIONS.last_gate, 1)
+    information = np.array([total for _, total in expected.values()])
+    information = 0.4 * joint_refinement._drop_weak_directions(information) + 1e-6 * np.eye(3)
+    edges = Edges(
+        np.concatenate((MOTION.sources, [j for _, j in expected])),
+        np.concatenate((MOTION.targets, [i for i, _ in expected])),
+        np.concatenate((MOTION.poses, [pose for pose, _ in expected.values()])),
+        np.concatenate((MOTION.covariances, np.linalg.inv(information))),
+    )
+    for belief, covariance, (i, j) in zip(found, relative_covariances(POSES, edges, between), between, strict=True):
+        np.testing.assert_allclose(belief.mean, se2.between(POSES[i], POSES[j]), atol=1e-12)
+        np.testing.assert_allclose(belief.covariance, covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_the_nearest_keyframes_are_those_within_reach_in_linked_areas():
+    rng = np.random.default_rng(6)
+    poses = np.column_stack((rng.uniform(-6.0, 6.0, (60, 2)), rng.uniform(-np.pi, np.pi, 60)))
+    areas, linked = 4 + np.arange(60) % 3, {4: {4, 5}, 5: {4, 5, 6}, 6: {5, 6}}
+    found = nearest_keyframes(poses, areas, poses[:20], areas[:20], linked, 4.0, 6)
+    for pose, area, rows in zip(poses, areas, found, strict=False):
+        distance, turn = np.hypot(*(poses[:, :2] - pose[:2]).T), np.abs(se2.wrap(poses[:, 2] - pose[2]))
+        near = [k for k in range(60) if distance[k] <= 4.0 and areas[k] in linked[area]]
+        assert rows.tolist() == sorted(near, key=lambda k: distance[k] + turn[k])[:6]
+    assert min(map(len, found)) < 6 == max(map(len, found))
+
+
+def test_pairs_are_each_once_and_in_order():
+    found = scan_pairs([np.array([0, 3, 1]), np.array([2]), np.array([], np.int64), np.array([3, 0, 2])], 0.2)
+    assert found.rows.tolist() == [[0, 1], [0, 3], [1, 2], [2, 3]]
+    assert found.min_share.tolist() == [0.2] * 4
+    assert scan_pairs([np.array([0])], 0.2).rows.shape == (0, 2)
+
+
+def test_a_keyframe_far_from_other_passes_is_paired_with_the_five_of_these_that_share_most_walls(surfaces, monkeypatch):
+    """Keyframes 0 to 29 along x, 30 to 59 beside them; keyframe 20 of the second pass is near one of the first."""
+    count, options = 60, replace(OPTIONS, reach=2.0)
+    along = np.arange(count) % 30
+    poses = np.column_stack((0.7 * along, 3.0 * (np.arange(count) >= 30), np.zeros(count)))
+    areas = np.where(np.arange(count) == 33, 1, 0)
+    shares = np.random.default_rng(4).uniform(0.0, 0.3, (count, count))
+    requested = []
+
+    def given_shares(first, rows, second, others, relative, gate, _weighting, stride):
+        assert (first, second, gate, stride) == (surfaces, surfaces, options.first_gate, 4)
+        np.testing.assert_allclose(relative, se2.between(poses[others], poses[rows]))
+        requested.append(int(rows[0]) if len(rows) else -1)
+        return None, None, shares[rows, others]
+
+    monkeypatch.setattr(joint_refinement, "normal_equations", given_shares)
+    near = ScanPairs(np.array([[3, 4], [4, 5], [7, 40], [9, 29], [10, 31]]), np.full(5, 0.2))
+    found = add_distant_pairs(near, surfaces, poses, areas, {0: {0}, 1: {1}}, options)
+    expected = set()
+    for i in set(range(count)) - {7, 40, 10, 31}:
+        others = [
+            k
+            for k in range(count)
+            if abs(k - i) > 20 and np.hypot(*(poses[k] - poses[i])[:2]) <= 10.0 and areas[k] == areas[i]
+        ]
+        most = sorted(others, key=lambda k: -shares[i, k])[:5]
+        expected |= {(min(i, k), max(i, k)) for k in most if shares[i, k] >= 0.03}
+    assert found.rows[:5].tolist() == near.rows.tolist()
+    assert [tuple(row) for row in found.rows[5:].tolist()] == sorted(expected)
+    assert found.min_share.tolist() == [0.2] * 5 + [0.03] * len(expected)
+    assert len(expected) > 100
