@@ -97,8 +97,8 @@ class AreaEvent:
     :ivar keyframes: for "cut": the stored keyframes that separate, ascending, including the newest; else empty.
     :ivar area: for "moved": the known area in which the robot is now; for "cut": the area that was left; for "merged":
         the area that becomes part of ``into``.
-    :ivar score: for "cut": the normalized cut; for "moved": the overlap with the new area; for "merged": the least
-        normalized cut of the joined graph.
+    :ivar score: for "cut": the normalized cut, 0 where a keyframe leaves since its pose is uncertain; for "moved": the
+        overlap with the new area; for "merged": the least normalized cut of the joined graph.
     :ivar into: for "merged": the area that remains, else None.
     """
 

@@ -309,15 +309,14 @@ class MotionModel:
                 self._state.odometry_pose,
                 self._inertia.forecast(seconds)[0],
                 self._squared_accelerations * seconds**4,
-                lambda step: (
-                    self.noise.scale(RelativeMotion(step, increment_covariance(step, self._motion))).covariance
-                ),
+                self._odometry_covariance,
                 self._motion.fault_probability,
             )
             self._search = (stamp, first, search)
         return self._search[2]
 
     def _odometry_covariance(self, step: Float64) -> Float64:
+        """The covariance (3, 3) of odometry over a motion, a twist (3,), with the measured noise."""
         return self.noise.scale(RelativeMotion(step, increment_covariance(step, self._motion))).covariance
 
     def predict(self, stamp: int) -> Prediction:
