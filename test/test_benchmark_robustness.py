@@ -14,7 +14,7 @@ from benchmark.real_faults import faulty_run
 from benchmark.real_faults.kinds import BY_NAME, KINDS
 from benchmark.real_faults.stream import ListedLog
 from benchmark.real_faults.stretches import RECORDED, _draw_window, draw_stretch
-from benchmark.real_faults.verdict import MapVerdict, StretchTruth, judge, near_scans, pieces_of_areas
+from benchmark.real_faults.verdict import MapVerdict, StretchTruth, judge, near_scans
 from benchmark.robustness import Attempt, FaultCase, _choose, is_named, outcome_table, requirements
 from benchmark.runs import Run
 from hmt_slam_ros.errors import HmtSlamError
@@ -58,10 +58,6 @@ def three_areas():
     hybrid_map.set_arc(0, 1, PoseGaussian(np.array([5.0, 0.0, 0.0]), 1e-4 * np.eye(3)), closure=False)
     hybrid_map.set_arc(1, 2, uninformative_belief(np.array([9.0, 0.0, 0.0])), closure=False)
     return hybrid_map
-
-
-def test_an_uninformative_arc_parts_two_pieces():
-    assert pieces_of_areas(three_areas()) == {0: 0, 1: 0, 2: 2}
 
 
 class ThreeScans:

@@ -6,7 +6,12 @@ import pytest
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import connected_areas, shortest_path_beliefs
+from hmt_slam_ros.hybrid_map.shortest_path import (
+    connected_areas,
+    map_pieces,
+    shortest_path_beliefs,
+    uninformative_belief,
+)
 
 
 def arc(x, y, theta, sigma_xy=0.1, sigma_theta=0.0):
@@ -169,3 +174,15 @@ def test_areas_are_connected_up_to_a_variance_of_300_m_squared(deviations, last)
     for area in range(3):
         hybrid_map.set_keyframe(area, area, np.zeros(3))
     assert list(connected_areas(hybrid_map, 0)) == list(range(last + 1))
+
+
+def test_pieces_are_what_informative_arcs_hold_together_however_uncertain():
+    hybrid_map = chain(*(arc(4.0, 1.0, 0.2, 200.0) for _ in range(3)))
+    for area in range(5):
+        hybrid_map.set_keyframe(area, area, np.zeros(3))
+    hybrid_map.set_arc(3, 4, uninformative_belief(np.zeros(3)), closure=False)
+    assert map_pieces(hybrid_map) == [[0, 1, 2, 3], [4]]
+    hybrid_map.set_arc(1, 2, uninformative_belief(np.zeros(3)), closure=False)
+    assert map_pieces(hybrid_map) == [[0, 1], [2, 3], [4]]
+    hybrid_map.set_arc(0, 4, arc(1.0, 0.0, 0.0, 1.0), closure=True)
+    assert map_pieces(hybrid_map) == [[0, 1, 4], [2, 3]]

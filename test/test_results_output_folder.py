@@ -350,7 +350,7 @@ def test_all_plots_are_drawn_from_the_files_alone(folder: Path) -> None:
 
 
 def test_plots_of_something_else_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(HmtSlamError, match="map the log again"):
+    with pytest.raises(HmtSlamError, match="give an output folder"):
         plots.plot_all(tmp_path)
 
 

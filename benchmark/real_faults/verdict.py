@@ -11,8 +11,7 @@ from benchmark.odometry import CLOSURE_ANGLE, CLOSURE_LIMIT, LONG_LIMIT, Closure
 from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.evaluation import Relations, StampedPoses, pair_errors
 from hmt_slam_ros.evaluation.relations import LONG_SPAN
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
+from hmt_slam_ros.hybrid_map.shortest_path import map_pieces
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.replica import Replica
@@ -116,24 +115,9 @@ def judge(
 
 def pieces_of_scans(recording: Recording) -> Int64:
     """The piece of the map to which each scan belongs, by its smallest area, shape (n,)."""
-    hybrid_map = recording.hybrid_map
-    piece_of_area = pieces_of_areas(hybrid_map)
-    area_of = {keyframe: area for area in hybrid_map.area_ids() for keyframe in hybrid_map.keyframes(area)}
-    keyframes = recording.relative_trajectory.keyframes
-    known = np.flatnonzero(keyframes >= 0)
-    pieces = np.array([piece_of_area[area_of[keyframe]] for keyframe in keyframes[known].tolist()], dtype=np.int64)
-    # A scan without a pose of its own lies between those before and after it.
-    before = np.clip(np.searchsorted(known, np.arange(keyframes.size), side="right") - 1, 0, None)
-    return pieces[before]
-
-
-def pieces_of_areas(hybrid_map: HybridMap) -> dict[int, int]:
-    """{area: smallest area of its piece}."""
-    pieces: dict[int, int] = {}
-    for area in sorted(hybrid_map.area_ids()):
-        if area not in pieces:
-            pieces |= dict.fromkeys(connected_areas(hybrid_map, area), area)
-    return pieces
+    piece_of_area = {area: piece[0] for piece in map_pieces(recording.hybrid_map) for area in piece}
+    areas = recording.relative_trajectory.areas(recording.hybrid_map)
+    return np.array([piece_of_area[area] for area in areas.tolist()], dtype=np.int64)
 
 
 def near_scans(relations: Relations, trajectory: StampedPoses) -> Bool:

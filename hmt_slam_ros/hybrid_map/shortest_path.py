@@ -248,3 +248,21 @@ def connected_areas(hybrid_map: HybridMap, area: int) -> dict[int, PoseGaussian]
 def connected_neighbors(hybrid_map: HybridMap, area: int) -> list[int]:
     """The areas one informative arc away, ascending."""
     return [other for other in hybrid_map.neighbors(area) if informative_arc(hybrid_map, area, other) is not None]
+
+
+def map_pieces(hybrid_map: HybridMap) -> list[list[int]]:
+    """The areas in pieces that informative arcs hold together, each ascending; the piece with the map's frame first.
+
+    The place of one piece in another is unknown.
+    """
+    pieces: list[list[int]] = []
+    for area in hybrid_map.area_ids():
+        if not any(area in piece for piece in pieces):
+            piece, reached = set[int](), [area]
+            while reached:
+                here = reached.pop()
+                if here not in piece:
+                    piece.add(here)
+                    reached += connected_neighbors(hybrid_map, here)
+            pieces.append(sorted(piece))
+    return pieces

@@ -14,18 +14,20 @@ from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
+from matplotlib.patches import Ellipse as EllipsePatch
+from matplotlib.path import Path as PlotPath
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import read_tum
-from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.grids.occupancy_map import OccupancyImage, read_map
+from hmt_slam_ros.geometry.gaussian import Ellipse, PoseGaussian
+from hmt_slam_ros.grids.occupancy_map import OCCUPIED, UNKNOWN, OccupancyImage
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.own_files import write_file
-from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
+from hmt_slam_ros.results.hmt_map import read_saved_map
+from hmt_slam_ros.results.pieces import MapPiece, image_corners, split_map
 from hmt_slam_ros.untrusted_input import MAX_TEXT_BYTES, read_text
 
 Color = tuple[float, float, float]
@@ -35,6 +37,12 @@ _DPI = 150
 
 _CLOSURE, _ARC, _PATH = "#d62728", "#1f3b70", "#555555"
 """Colors of arcs that closed a loop, of other arcs and of the path."""
+
+_MIN_SHARE = 0.25
+"""Least width of a piece of the map in its picture, as a share of the widest."""
+
+_BAND_SHARE = 0.025
+"""Width of the hatched band along the frame, as a share of the longer side of the map."""
 
 _GOLDEN = 0.6180339887498949
 """Golden section: steps of the hue from one number to the next."""
@@ -50,21 +58,37 @@ def plot_all(directory: Path) -> list[Path]:
 
 
 def plot_map(directory: Path) -> Path:
-    """Draw map.png: the occupancy grid with path, areas, arcs and the 95 % ellipses of the areas' origins."""
-    image, saved = read_map(directory), read_saved_map(directory / "hmt_map")
-    path = read_tum(directory / "trajectory.tum").poses[:, :2]
-    height, width = (size * image.resolution for size in image.pixels.shape)
-    figure = Figure(figsize=_figure_size(width, height), layout="constrained")
-    axes = figure.add_subplot()
+    """Draw map.png: the occupancy grid with path, areas, arcs and the 95 % ellipses of the areas' origins.
+
+    The extent is that of the grid and the keyframes. An ellipse that exceeds it is cut off at the frame, and hatched
+    there. Pieces whose place in the map is unknown stand beside it, in frames of their own.
+    """
+    saved = read_saved_map(directory / "hmt_map")
     hybrid_map = saved.replica.maps[saved.replica.best_hypothesis]
-    _draw_grid(axes, image)
-    axes.plot(path[:, 0], path[:, 1], color=_PATH, linewidth=0.8, label="path", zorder=2)
-    _draw_keyframes(axes, hybrid_map, saved.area_poses)
-    _draw_arcs(axes, hybrid_map, saved.area_poses)
-    _draw_areas(axes, saved, 0.01 * max(width, height))
-    axes.set_title(_map_title(hybrid_map, path), fontsize=9)
-    axes.legend(loc="best", fontsize=7, framealpha=0.9)
+    trajectory = read_tum(directory / "trajectory.tum").poses
+    pieces = split_map(directory, saved, trajectory)
+    sizes = np.array([np.diff(piece.corners, axis=0)[0] for piece in pieces])
+    widths = np.maximum(sizes[:, 0], _MIN_SHARE * sizes[:, 0].max())
+    figure = Figure(figsize=_figure_size(float(widths.sum()), float(sizes[:, 1].max())), layout="constrained")
+    row = figure.subplots(1, len(pieces), squeeze=False, width_ratios=widths)[0]
+    for axes, piece in zip(row, pieces, strict=True):
+        _draw_piece(axes, hybrid_map, piece)
+        axes.set_title("place unknown", fontsize=9)
+    row[0].set_title(_map_title(hybrid_map, trajectory[:, :2]), fontsize=9)
+    row[0].legend(loc="best", fontsize=7, framealpha=0.9)
     return _save(figure, directory / "map.png")
+
+
+def _draw_piece(axes: Axes, hybrid_map: HybridMap, piece: MapPiece) -> None:
+    _draw_grid(axes, piece.image)
+    left, bottom, right, top = piece.corners.ravel().tolist()
+    axes.set_xlim(left, right)
+    axes.set_ylim(bottom, top)
+    axes.plot(piece.path[:, 0], piece.path[:, 1], color=_PATH, linewidth=0.8, label="path", zorder=2)
+    for area, positions in piece.keyframes.items():
+        axes.plot(positions[:, 0], positions[:, 1], ".", color=_color_of(area), markersize=4, zorder=3)
+    _draw_arcs(axes, hybrid_map, piece.area_poses)
+    _draw_areas(axes, piece.area_poses, 0.01 * float(np.diff(piece.corners, axis=0).max()))
 
 
 def _figure_size(width: float, height: float) -> tuple[float, float]:
@@ -73,11 +97,12 @@ def _figure_size(width: float, height: float) -> tuple[float, float]:
 
 
 def _draw_grid(axes: Axes, image: OccupancyImage) -> None:
-    axes.add_artist(_GridArtist(axes, image.pixels))
-    height, width = image.pixels.shape
-    left, bottom = image.origin
-    axes.set_xlim(left, left + width * image.resolution)
-    axes.set_ylim(bottom, bottom + height * image.resolution)
+    axes.add_artist(_GridArtist(axes, image, walls_only=False))
+    axes.add_artist(_GridArtist(axes, image, walls_only=True))
+    axes.set_facecolor(str(int(UNKNOWN) / 255))
+    left, bottom, right, top = image_corners(image).ravel().tolist()
+    axes.set_xlim(left, right)
+    axes.set_ylim(bottom, top)
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
@@ -85,21 +110,25 @@ def _draw_grid(axes: Axes, image: OccupancyImage) -> None:
 
 
 class _GridArtist(Artist):
-    """The occupancy grid, which fills the axes. ``imshow`` would take 60 MB more for colors and interpolation."""
+    """The occupancy grid. ``imshow`` would take 60 MB more for colors and interpolation.
 
-    def __init__(self, axes: Axes, pixels: NDArray[np.uint8]) -> None:
+    The walls alone are drawn once more, over the fill of the ellipses.
+    """
+
+    def __init__(self, axes: Axes, image: OccupancyImage, *, walls_only: bool) -> None:
         super().__init__()
-        self._grid_axes, self._pixels = axes, pixels
-        self.set_zorder(0)
+        self._grid_axes, self._image, self._walls_only = axes, image, walls_only
+        self.set_zorder(1.5 if walls_only else 0)
 
     def draw(self, renderer: RendererBase) -> None:
         """Paint each pixel in the darkest gray of its cells, so that walls stay visible."""
-        box = self._grid_axes.get_window_extent(renderer)
-        left, bottom = round(box.x0), round(box.y0)
-        width, height = round(box.x1) - left, round(box.y1) - bottom
-        gray = _darkest_rows(_darkest_rows(self._pixels, height).T, width).T[::-1]
+        corners = self._grid_axes.transData.transform(image_corners(self._image)).round().astype(int)
+        (left, bottom), (width, height) = corners[0].tolist(), np.diff(corners, axis=0)[0].tolist()
+        gray = _darkest_rows(_darkest_rows(self._image.pixels, height).T, width).T[::-1]
         colors = np.full((height, width, 4), 255, np.uint8)
         colors[..., :3] = gray[..., None]
+        if self._walls_only:
+            colors[gray != OCCUPIED, 3] = 0
         renderer.draw_image(renderer.new_gc(), left, bottom, colors)
 
 
@@ -109,49 +138,36 @@ def _darkest_rows(pixels: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
     return pixels[starts] if count >= len(pixels) else np.minimum.reduceat(pixels, starts)
 
 
-def _draw_keyframes(axes: Axes, hybrid_map: HybridMap, area_poses: Mapping[int, PoseGaussian]) -> None:
-    for area in sorted(area_poses.keys() & set(hybrid_map.area_ids())):
-        poses = np.array(list(hybrid_map.keyframes(area).values())).reshape(-1, 3)
-        points = se2.transform(area_poses[area].mean, poses[:, :2])
-        axes.plot(points[:, 0], points[:, 1], ".", color=_color_of(area), markersize=4, zorder=3)
-
-
 def _draw_arcs(axes: Axes, hybrid_map: HybridMap, area_poses: Mapping[int, PoseGaussian]) -> None:
+    """Draw the arcs within a piece, uninformative ones dashed."""
     for closure, color, label in ((False, _ARC, "arc"), (True, _CLOSURE, "arc that closed a loop")):
-        ends = [
-            (area_poses[a].mean[:2], area_poses[b].mean[:2])
+        arcs = [
+            ((area_poses[a].mean[:2], area_poses[b].mean[:2]), "--" if is_uninformative(arc.pose) else "-")
             for a, b, arc in hybrid_map.all_arcs()
             if arc.closure == closure and {a, b} <= area_poses.keys()
         ]
-        if ends:
-            axes.add_collection(LineCollection(ends, colors=color, linewidths=1.2, label=label, zorder=4))
+        if arcs:
+            ends, styles = map(list, zip(*arcs, strict=True))
+            lines = LineCollection(ends, colors=color, linestyles=styles, linewidths=1.2, label=label, zorder=4)
+            axes.add_collection(lines)
 
 
-def _draw_areas(axes: Axes, saved: SavedMap, visible: float) -> None:
+def _draw_areas(axes: Axes, area_poses: Mapping[int, PoseGaussian], visible: float) -> None:
     """Draw origins, ids and ellipses.
 
     :param visible: least semi-major axis of the largest ellipse, m; smaller ones are enlarged by a round factor.
     """
-    ellipses = {area: belief.position_ellipse() for area, belief in saved.area_poses.items()}
+    ellipses = {area: belief.position_ellipse() for area, belief in area_poses.items()}
     largest = max(ellipse.semi_major for ellipse in ellipses.values())
     factor = 1 if largest <= 0.0 else int(10 ** np.clip(np.ceil(np.log10(visible / largest)), 0, 2))
-    for area, ellipse in ellipses.items():
-        x, y = saved.area_poses[area].mean[:2].tolist()
-        axes.add_patch(
-            Ellipse(
-                (x, y),
-                2.0 * factor * ellipse.semi_major,
-                2.0 * factor * ellipse.semi_minor,
-                zorder=5,
-                angle=float(np.degrees(ellipse.angle)),
-                facecolor=(*_color_of(area), 0.25),
-                edgecolor=_color_of(area),
-                linewidth=1.0,
-            )
-        )
+    is_exceeding = [
+        _draw_ellipse(axes, area_poses[area].mean, ellipse, factor, _color_of(area))
+        for area, ellipse in ellipses.items()
+    ]
+    for area, belief in area_poses.items():
         axes.annotate(
             str(area),
-            (x, y),
+            belief.mean[:2].tolist(),
             ha="center",
             va="center",
             fontsize=7,
@@ -160,7 +176,38 @@ def _draw_areas(axes: Axes, saved: SavedMap, visible: float) -> None:
             bbox={"boxstyle": "circle,pad=0.25", "facecolor": "white", "edgecolor": _color_of(area), "linewidth": 1.5},
         )
     enlarged = f", enlarged {factor} times" if factor > 1 else ""
-    axes.plot([], [], "o", markerfacecolor="none", color="black", label=f"area, 95 % ellipse{enlarged}")
+    hatched = ", hatched where it exceeds the map" if any(is_exceeding) else ""
+    axes.plot([], [], "o", markerfacecolor="none", color="black", label=f"area, 95 % ellipse{enlarged}{hatched}")
+
+
+def _draw_ellipse(axes: Axes, mean: NDArray[np.float64], ellipse: Ellipse, factor: int, color: Color) -> bool:
+    """Draw an ellipse under the walls; returns whether it exceeds the map.
+
+    One that does is hatched along the frame and has no fill, which would hide the map.
+    """
+    major, minor = factor * ellipse.semi_major, factor * ellipse.semi_minor
+    cos, sin = np.cos(ellipse.angle), np.sin(ellipse.angle)
+    extent = np.array([np.hypot(major * cos, minor * sin), np.hypot(major * sin, minor * cos)])
+    low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+    exceeds = bool((mean[:2] - extent < low).any() or (mean[:2] + extent > high).any())
+    shape = {"xy": mean[:2].tolist(), "width": 2.0 * major, "height": 2.0 * minor, "angle": np.degrees(ellipse.angle)}
+    fill = "none" if exceeds else (*color, 0.25)
+    axes.add_patch(EllipsePatch(**shape, zorder=1, facecolor=fill, edgecolor=color, linewidth=0.5 if exceeds else 1.0))
+    if exceeds:
+        hatch = EllipsePatch(**shape, zorder=1, facecolor="none", edgecolor=color, linewidth=0.0, hatch="////")
+        axes.add_patch(hatch)
+        hatch.set_clip_path(_frame_band(low, high), axes.transData)
+    return exceeds
+
+
+def _frame_band(low: NDArray[np.float64], high: NDArray[np.float64]) -> PlotPath:
+    """The band inside the frame from one corner to the other: its outline, and that of the hole the other way round."""
+    width = _BAND_SHARE * float((high - low).max())
+    corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)], dtype=float)
+    outer = low + corners * (high - low)
+    inner = low + width + corners[::-1] * (high - low - 2.0 * width)
+    codes = [PlotPath.MOVETO, *[PlotPath.LINETO] * 3, PlotPath.CLOSEPOLY]
+    return PlotPath(np.concatenate((outer, inner)), codes * 2)
 
 
 def _map_title(hybrid_map: HybridMap, path: NDArray[np.float64]) -> str:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.messages import ScanPoses
 from hmt_slam_ros.messages.replica import FIRST_AREA
 
@@ -55,6 +56,14 @@ class RelativeTrajectory(NamedTuple):
         map_T_keyframe = np.array([keyframes[keyframe] for keyframe in self.keyframes[known].tolist()])
         poses[known] = se2.between(map_T_keyframe, trajectory[known])
         return RelativeTrajectory(self.keyframes, poses)
+
+    def areas(self, hybrid_map: HybridMap) -> Int64:
+        """The area of each scan, shape (n,); of a scan without a pose, that of the one before it."""
+        area_of = {keyframe: area for area in hybrid_map.area_ids() for keyframe in hybrid_map.keyframes(area)}
+        known = np.flatnonzero(self.keyframes >= 0)
+        areas = np.array([area_of[keyframe] for keyframe in self.keyframes[known].tolist()], dtype=np.int64)
+        before = np.searchsorted(known, np.arange(self.keyframes.size), side="right") - 1
+        return areas[np.maximum(before, 0)]
 
 
 class OnlineEstimate(NamedTuple):
