@@ -180,7 +180,7 @@ def test_the_edges_of_a_refinement_are_motion_rigid_areas_and_arcs_between_their
         ad = se2.adjoint(se2.inverse(second))
         np.testing.assert_allclose(edge.covariance, inflation * ad @ arc.covariance @ ad.T)
     assert [(a, b) for a, b, _ in ClosureRefinement(configuration)._edges(hybrid_map, [0, 1], [0])][-1] == (4, 10)
-    stacked = closure_refinement._stack_edges(edges, sorted({k for a, b, _ in edges for k in (a, b)}))
+    stacked = closure_refinement.stack_edges(edges, sorted({k for a, b, _ in edges for k in (a, b)}))
     assert stacked.sources.tolist() == [0, 1, 3, 4, 6, 1, 3]
     assert stacked.targets.tolist() == [1, 2, 4, 5, 7, 3, 6]
     np.testing.assert_array_equal(stacked.poses[6], edges[6][2].mean)

@@ -8,14 +8,19 @@ from worlds import drive, scan_in, two_rooms
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import Edges, relative_covariances
 from hmt_slam_ros.loop_closure import joint_refinement
 from hmt_slam_ros.loop_closure.joint_refinement import (
+    PairLimits,
     ScanPairs,
     add_distant_pairs,
     nearest_keyframes,
+    pair_limits,
     relative_beliefs,
     scan_pairs,
+    total_agreement,
 )
 from hmt_slam_ros.registration.scan_to_scan import extract_surfaces, normal_equations, weighting_from_options
 
@@ -62,6 +67,71 @@ def test_pairs_that_overlap_become_edges_from_the_second_to_the_first(surfaces, 
     for pose, covariance, (step, information) in zip(edges.poses, edges.covariances, expected.values(), strict=True):
         np.testing.assert_allclose(pose, step, atol=1e-9)
         np.testing.assert_allclose(covariance @ information, np.eye(3), atol=1e-8)
+
+
+def counted_pairs(surfaces, poses, limits):
+    """The pairs whose registration counts."""
+    edges = joint_refinement._register_pairs(surfaces, poses, PAIRS, 0.3, 1, OPTIONS, limits)
+    return set(zip(edges.targets.tolist(), edges.sources.tolist(), strict=True))
+
+
+def test_a_registration_counts_only_within_what_the_arcs_allow(surfaces):
+    poses = POSES.copy()
+    poses[2] = se2.compose(POSES[2], [0.2, 0.0, 0.0])
+    relative = se2.between(poses[PAIRS.rows[:, 1]], poses[PAIRS.rows[:, 0]])
+    information = np.zeros((5, 3, 3))
+    assert {(0, 2), (1, 2)} <= counted_pairs(surfaces, poses, PairLimits(relative, information))
+    # The scans move both pairs by 0.2 m, one may move by 0.33 m and the other by 0.16 m at most.
+    information[1], information[2] = np.eye(3) / 0.1**2 * 1.5, np.eye(3) / 0.04**2
+    kept = counted_pairs(surfaces, poses, PairLimits(relative, information))
+    assert (0, 2) in kept
+    assert (1, 2) not in kept
+
+
+def test_a_registration_counts_only_where_the_scans_agree_better_than_before(surfaces):
+    """One pair was right before, and would be registered from a pose too far away to come back to it."""
+    poses = POSES.copy()
+    poses[2] = se2.compose(POSES[2], [0.25, 0.1, 0.1])
+    before, now = (se2.between(at[PAIRS.rows[:, 1]], at[PAIRS.rows[:, 0]]) for at in (POSES, poses))
+    free = np.zeros((5, 3, 3))
+    assert (1, 2) in counted_pairs(surfaces, poses, PairLimits(now, free))
+    assert (1, 2) not in counted_pairs(surfaces, poses, PairLimits(before, free))
+
+
+def test_agreement_is_the_sum_of_the_weights_of_points_and_lets_outliers_count_for_little(surfaces):
+    pair = ScanPairs(PAIRS.rows[:1], PAIRS.min_share[:1])
+    totals = []
+    for offset in (0.0, 0.02, 0.1, 30.0):
+        poses = POSES.copy()
+        poses[1] = se2.compose(POSES[1], [offset, 0.0, 0.0])
+        totals.append(total_agreement(surfaces, poses, pair, OPTIONS))
+    assert totals[0] > totals[1] > totals[2] > totals[3] == 0.0
+    count = surfaces.starts[1]
+    assert totals[0] <= count * OPTIONS.temper / OPTIONS.sigma**2
+
+
+def test_pairs_of_two_areas_are_limited_by_the_arcs_between_them():
+    covariances = np.diag([0.01, 0.02, 0.003]), np.diag([0.04, 0.01, 0.001])
+    hybrid_map, frames = HybridMap(), [np.zeros(3), np.array([4.0, 1.0, 0.3]), np.array([7.0, 1.0, -0.4])]
+    areas, area_T_scan = np.array([0, 0, 1, 2, 2]), np.zeros((5, 3))
+    for row, area in enumerate(areas.tolist()):
+        area_T_scan[row] = se2.between(frames[area], POSES[row])
+        hybrid_map.set_keyframe(row, area, area_T_scan[row])
+    for a, covariance in enumerate(covariances):
+        hybrid_map.set_arc(a, a + 1, PoseGaussian(se2.between(frames[a], frames[a + 1]), covariance), closure=False)
+    limits = pair_limits(hybrid_map, POSES, PAIRS, areas, area_T_scan)
+    np.testing.assert_allclose(limits.relative, se2.between(POSES[PAIRS.rows[:, 1]], POSES[PAIRS.rows[:, 0]]))
+    for (i, j), information in zip(PAIRS.rows.tolist(), limits.information, strict=True):
+        if areas[i] == areas[j]:
+            assert not information.any()
+            continue
+        belief = PoseGaussian.from_pose(frames[areas[i]])
+        for a in range(areas[i], areas[j]):
+            belief = belief.compose(hybrid_map.arc(a, a + 1))
+        # Of the second scan in the first one's area, then of the first scan in the second.
+        belief = PoseGaussian.from_pose(se2.inverse(POSES[i])).compose(belief)
+        pair = belief.compose(PoseGaussian.from_pose(area_T_scan[j])).inverse()
+        np.testing.assert_allclose(np.linalg.inv(information), pair.covariance, rtol=1e-9, atol=1e-12)
 
 
 def test_directions_with_next_to_no_information_are_dropped():

@@ -3,11 +3,18 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from test_results_output_folder import EVERY, SCANS, STAMPS, TRUTH, make_recorder, scan
+from worlds import scan_in, two_rooms
 
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.messages.messages import Notice
+from hmt_slam_ros.results import final_map as results_final_map
 from hmt_slam_ros.results.final_map import final_map
-from hmt_slam_ros.results.recorder import Recording
+from hmt_slam_ros.results.recorder import Recorder, Recording, keyframe_poses
+from hmt_slam_ros.results.trajectories import trajectory_in_map
 from hmt_slam_ros.sensors import Scan
 
 
@@ -30,3 +37,99 @@ def test_where_no_scans_overlap_the_motion_that_metric_slam_found_stands() -> No
     off = se2.between(TRUTH, found)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 1e-6
     assert np.abs(off[:, 2]).max() < 1e-6
+
+
+def room_scan(index: int) -> Scan:
+    """Two rooms with a door between them, from the true pose."""
+    pose = se2.compose(np.array([2.0, 2.9, 0.0]), TRUTH[index])
+    return scan_in(two_rooms(), pose, stamp=int(STAMPS[index]), beams=361)
+
+
+def room_recording(recorder: Recorder) -> Recording:
+    """The small run with these scans."""
+    recording = recorder.finish(STAMPS)
+    scans = {keyframe: room_scan(EVERY * keyframe) for keyframe in recording.replica.scans}
+    return replace(recording, replica=replace(recording.replica, scans=scans))
+
+
+def with_arc(recording: Recording, offset: np.ndarray, covariance: np.ndarray) -> Recording:
+    """The recording with area 1 displaced by an offset in the frame of its arc, and a covariance of that."""
+    hybrid_map = recording.hybrid_map.branch()
+    arc = hybrid_map.arc(0, 1)
+    assert arc is not None
+    moved = PoseGaussian(se2.compose(arc.mean, offset), covariance)
+    hybrid_map.set_arc(0, 1, moved, closure=False)
+    origin = PoseGaussian.from_pose(recording.area_poses[0].mean)
+    area_poses = recording.area_poses | {1: origin.compose(moved)}
+    maps = recording.replica.maps | {recording.replica.best_hypothesis: hybrid_map}
+    poses = keyframe_poses(hybrid_map, area_poses)
+    return replace(
+        recording,
+        replica=replace(recording.replica, maps=maps),
+        area_poses=area_poses,
+        trajectory=trajectory_in_map(recording.relative_trajectory, poses),
+    )
+
+
+def refined_arc(recording: Recording, configuration: Configuration) -> tuple[np.ndarray, tuple[Notice, ...]]:
+    """Pose of area 1 in area 0 after the refinement, and its notices."""
+    final = final_map(recording, map(room_scan, range(SCANS)), configuration).recording
+    arc = final.hybrid_map.arc(0, 1)
+    assert arc is not None
+    return arc.mean, final.notices[len(recording.notices) :]
+
+
+def test_the_scans_move_an_area_within_what_its_arc_allows() -> None:
+    """Its place is off by 0.2 m: a wide arc lets the scans move it, a sure one does not."""
+    recorder = make_recorder()
+    recording, offset = room_recording(recorder), np.array([0.0, 0.2, 0.0])
+    truth = recording.hybrid_map.arc(0, 1)
+    assert truth is not None
+    ends = {}
+    for sigma in (0.3, 0.01):
+        wrong = with_arc(recording, offset, np.diag([sigma, sigma, 0.3 * sigma]) ** 2)
+        found, notices = refined_arc(wrong, recorder.configuration)
+        ends[sigma] = float(np.hypot(*se2.between(truth.mean, found)[:2]))
+        assert notices == ()
+    assert ends[0.3] < 0.05
+    assert ends[0.01] > 0.15
+
+
+def test_sure_arcs_hold_areas_together() -> None:
+    """Area 1 is drawn 0.2 m beside its place by a sure arc, so that no pair of scans may bring it there."""
+    recorder = make_recorder()
+    sure = with_arc(room_recording(recorder), np.zeros(3), 0.01**2 * np.eye(3))
+    arc = sure.hybrid_map.arc(0, 1)
+    assert arc is not None
+    beside = PoseGaussian(se2.compose(sure.area_poses[1].mean, np.array([0.0, 0.2, 0.0])), arc.covariance)
+    found, _ = refined_arc(replace(sure, area_poses=sure.area_poses | {1: beside}), recorder.configuration)
+    assert np.hypot(*se2.between(arc.mean, found)[:2]) < 0.05
+
+
+def test_a_result_with_which_the_scans_agree_less_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorder = make_recorder()
+    recording = room_recording(recorder)
+    before = keyframe_poses(recording.hybrid_map, recording.area_poses)
+
+    def scatter(surfaces: object, poses: np.ndarray, *_: object, **__: object) -> np.ndarray:
+        return se2.compose(poses, np.random.default_rng(1).normal(0.0, 0.3, poses.shape))
+
+    monkeypatch.setattr(results_final_map, "refine_jointly", scatter)
+    final = final_map(recording, map(room_scan, range(SCANS)), recorder.configuration).recording
+    after = keyframe_poses(final.hybrid_map, final.area_poses)
+    for keyframe, pose in before.items():
+        np.testing.assert_allclose(after[keyframe], pose, atol=1e-12)
+
+
+def test_a_notice_names_an_arc_that_was_left_by_more_than_it_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorder = make_recorder()
+    right = room_recording(recorder)
+    recording = with_arc(right, np.array([0.3, 0.0, 0.0]), np.diag([0.05, 0.05, 0.02]) ** 2)
+    poses = keyframe_poses(right.hybrid_map, right.area_poses)
+    monkeypatch.setattr(
+        results_final_map, "refine_jointly", lambda *_, **__: np.array([poses[k] for k in sorted(poses)])
+    )
+    _, (notice,) = refined_arc(recording, recorder.configuration)
+    assert notice.text.startswith("area 1 moved by 0.30 m and 0.0 degrees as seen from area 0, more than their arc")
+    allowed = with_arc(right, np.array([0.3, 0.0, 0.0]), np.diag([0.2, 0.05, 0.02]) ** 2)
+    assert refined_arc(allowed, recorder.configuration)[1] == ()

@@ -88,11 +88,11 @@ class ClosureRefinement:
         poses = np.array([se2.compose(frames[area_of[k]].mean, hybrid_map.keyframes(area_of[k])[k]) for k in ids])
         surfaces = extract_surfaces([scans[keyframe] for keyframe in ids], self._max_range, self._options.max_points)
         pairs = self._scan_pairs(poses, np.array([area_of[keyframe] for keyframe in ids], dtype=np.int64))
-        edges = _stack_edges(self._edges(hybrid_map, areas, closed, _CLOSURE_ARC_INFLATION), ids)
+        edges = stack_edges(self._edges(hybrid_map, areas, closed, _CLOSURE_ARC_INFLATION), ids)
         fixed = ids.index(_reference_keyframe(hybrid_map, closed[0]))
         refined_poses = refine_jointly(surfaces, poses, pairs, edges, self._options, fixed)
         refined = _split_by_area(hybrid_map, dict(zip(ids, refined_poses, strict=True)), areas, closed)
-        motion_edges = _stack_edges(self._edges(hybrid_map, areas, areas), ids)
+        motion_edges = stack_edges(self._edges(hybrid_map, areas, areas), ids)
         return self._with_covariances(refined, surfaces, refined_poses, pairs, motion_edges, ids)
 
     def _with_covariances(
@@ -138,14 +138,7 @@ class ClosureRefinement:
         """
         for area in areas:
             yield from self._motion_edges(hybrid_map, area) if area in closed else _rigid_edges(hybrid_map, area)
-        for a, b, arc in hybrid_map.all_arcs():
-            if a in areas and b in areas:
-                first, second = _reference_keyframe(hybrid_map, a), _reference_keyframe(hybrid_map, b)
-                first_T_a = PoseGaussian.from_pose(se2.inverse(hybrid_map.keyframes(a)[first]))
-                b_T_second = PoseGaussian.from_pose(hybrid_map.keyframes(b)[second])
-                covariance = (inflation if arc.closure else 1.0) * arc.pose.covariance
-                a_T_b = PoseGaussian(arc.pose.mean, covariance)
-                yield first, second, first_T_a.compose(a_T_b).compose(b_T_second)
+        yield from arc_edges(hybrid_map, areas, inflation)
 
     def _motion_edges(self, hybrid_map: HybridMap, area: int) -> Iterator[KeyframeEdge]:
         """Edges between successive keyframes of an area, with wide covariances between two traversals."""
@@ -173,6 +166,21 @@ def _reference_keyframe(hybrid_map: HybridMap, area: int) -> int:
     return next(iter(hybrid_map.keyframes(area)))
 
 
+def arc_edges(hybrid_map: HybridMap, areas: Collection[int], inflation: float = 1.0) -> Iterator[KeyframeEdge]:
+    """The arcs between given areas as edges between their first keyframes.
+
+    :param inflation: factor on the covariances of arcs that closed a loop.
+    """
+    for a, b, arc in hybrid_map.all_arcs():
+        if a in areas and b in areas:
+            first, second = _reference_keyframe(hybrid_map, a), _reference_keyframe(hybrid_map, b)
+            first_T_a = PoseGaussian.from_pose(se2.inverse(hybrid_map.keyframes(a)[first]))
+            b_T_second = PoseGaussian.from_pose(hybrid_map.keyframes(b)[second])
+            covariance = (inflation if arc.closure else 1.0) * arc.pose.covariance
+            a_T_b = PoseGaussian(arc.pose.mean, covariance)
+            yield first, second, first_T_a.compose(a_T_b).compose(b_T_second)
+
+
 def _rigid_edges(hybrid_map: HybridMap, area: int) -> Iterator[KeyframeEdge]:
     poses = hybrid_map.keyframes(area)
     reference = _reference_keyframe(hybrid_map, area)
@@ -181,14 +189,14 @@ def _rigid_edges(hybrid_map: HybridMap, area: int) -> Iterator[KeyframeEdge]:
             yield reference, keyframe, PoseGaussian(se2.between(poses[reference], poses[keyframe]), _RIGID_COVARIANCE)
 
 
-def _stack_edges(edges: Iterable[KeyframeEdge], ids: list[int]) -> Edges:
-    row = {keyframe: i for i, keyframe in enumerate(ids)}
-    sources, targets, beliefs = zip(*edges, strict=True)
+def stack_edges(edges: Iterable[KeyframeEdge], ids: list[int]) -> Edges:
+    """Edges between keyframes as edges between their rows in ``ids``."""
+    row, stacked = {keyframe: i for i, keyframe in enumerate(ids)}, list(edges)
     return Edges(
-        np.array([row[keyframe] for keyframe in sources], dtype=np.int64),
-        np.array([row[keyframe] for keyframe in targets], dtype=np.int64),
-        np.array([belief.mean for belief in beliefs]),
-        np.array([belief.covariance for belief in beliefs]),
+        np.array([row[first] for first, _, _ in stacked], dtype=np.int64),
+        np.array([row[second] for _, second, _ in stacked], dtype=np.int64),
+        np.array([belief.mean for _, _, belief in stacked]).reshape(-1, 3),
+        np.array([belief.covariance for _, _, belief in stacked]).reshape(-1, 3, 3),
     )
 
 

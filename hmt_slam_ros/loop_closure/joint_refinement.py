@@ -17,7 +17,7 @@ from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.topology import RefinementParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, propagate_covariance
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import Edges, optimize, relative_covariances
 from hmt_slam_ros.hybrid_map.shortest_path import connected_neighbors, shortest_path_beliefs
@@ -61,6 +61,10 @@ _MIN_INFORMATION_SHARE = 0.004
 """Smallest information along a direction relative to the largest: normals are off by some hundredths."""
 
 
+_GATE = chi_square_gate(0.999)
+"""Largest squared Mahalanobis distance of a registration from what the arcs say of a pair."""
+
+
 class ScanPairs(NamedTuple):
     """Scans that may overlap.
 
@@ -70,6 +74,17 @@ class ScanPairs(NamedTuple):
 
     rows: Int64
     min_share: Float64
+
+
+class PairLimits(NamedTuple):
+    """What registrations of pairs have to comply with.
+
+    :ivar relative: shape (m, 3), pose of the first scan in the second before the refinement.
+    :ivar information: shape (m, 3, 3), of these poses by the arcs, zero where they limit nothing.
+    """
+
+    relative: Float64
+    information: Float64
 
 
 def linked_areas(hybrid_map: HybridMap) -> dict[int, frozenset[int]]:
@@ -197,6 +212,7 @@ def refine_jointly(
     motion_edges: Edges,
     options: RefinementParameters,
     fixed: int = 0,
+    limits: PairLimits | None = None,
 ) -> Float64:
     """The poses that agree best with all registrations and the motion between them.
 
@@ -205,14 +221,58 @@ def refine_jointly(
     :param pairs: scans that may overlap.
     :param motion_edges: edges of the motion, which connect all scans, also along the directions that walls leave open.
     :param fixed: the scan that stays.
+    :param limits: None where all registrations count.
     :returns: shape (n, 3).
     """
     gates = np.geomspace(options.first_gate, options.last_gate, options.iterations)
     for k, gate in enumerate(gates.tolist(), start=1):
         stride = _EARLY_STRIDE if k < len(gates) else 1
-        edges = _concatenate_edges(motion_edges, _register_pairs(surfaces, poses, pairs, gate, stride, options))
+        registered = _register_pairs(surfaces, poses, pairs, gate, stride, options, limits)
+        edges = concatenate_edges(motion_edges, registered)
         poses = optimize(poses, edges, fixed, marginals=False, tolerance=_TOLERANCE).poses
     return poses
+
+
+def pair_limits(
+    hybrid_map: HybridMap, poses: Float64, pairs: ScanPairs, areas: Int64, area_T_scan: Float64
+) -> PairLimits:
+    """The limits of pairs by the least uncertain paths of arcs between their areas; none within an area.
+
+    :param poses: shape (n, 3), of the scans in the map.
+    :param areas: shape (n,), their areas.
+    :param area_T_scan: shape (n, 3), their poses in these.
+    """
+    first, second = pairs.rows.T
+    information = np.zeros((len(first), 3, 3))
+    for area in np.unique(areas).tolist():
+        rows = np.flatnonzero((areas[second] == area) & (areas[first] != area))
+        others = areas[first[rows]].tolist()
+        beliefs = shortest_path_beliefs(hybrid_map, area, targets=others) if others else {}
+        for row, other in zip(rows.tolist(), others, strict=True):
+            covariance = propagate_covariance(beliefs[other].covariance, area_T_scan[first[row]])
+            information[row] = np.linalg.inv(covariance)
+    return PairLimits(se2.between(poses[second], poses[first]), information)
+
+
+def total_agreement(surfaces: ScanSurfaces, poses: Float64, pairs: ScanPairs, options: RefinementParameters) -> float:
+    """How much all pairs of scans agree at given poses, shape (n, 3): the sum of the weights of their points."""
+    first, second = pairs.rows.T
+    return float(
+        _agreement(surfaces, pairs, se2.between(poses[second], poses[first]), options.last_gate, 1, options).sum()
+    )
+
+
+def _agreement(
+    surfaces: ScanSurfaces, pairs: ScanPairs, relative: Float64, gate: float, stride: int, options: RefinementParameters
+) -> Float64:
+    """The sum of the weights of each pair's points at given relative poses, shape (m, 3), which outliers cannot raise.
+
+    Normals are unit vectors, so that it is the trace of the information of the position.
+    """
+    first, second = pairs.rows.T
+    weighting = weighting_from_options(options)
+    information, _, _ = normal_equations(surfaces, first, surfaces, second, relative, gate, weighting, stride)
+    return np.asarray(information[:, 0, 0] + information[:, 1, 1])
 
 
 def relative_beliefs(
@@ -234,7 +294,7 @@ def relative_beliefs(
     """
     registered = _register_pairs(surfaces, poses, pairs, options.last_gate, 1, options)
     information = options.certainty * _drop_weak_directions(_invert(registered.covariances)) + _NEGLIGIBLE_INFORMATION
-    edges = _concatenate_edges(motion_edges, replace(registered, covariances=_invert(information)))
+    edges = concatenate_edges(motion_edges, replace(registered, covariances=_invert(information)))
     means = se2.between(poses[between[:, 0]], poses[between[:, 1]])
     return list(map(PoseGaussian, means, relative_covariances(poses, edges, between)))
 
@@ -252,22 +312,37 @@ def _drop_weak_directions(information: Float64) -> Float64:
 
 
 def _register_pairs(
-    surfaces: ScanSurfaces, poses: Float64, pairs: ScanPairs, gate: float, stride: int, options: RefinementParameters
+    surfaces: ScanSurfaces,
+    poses: Float64,
+    pairs: ScanPairs,
+    gate: float,
+    stride: int,
+    options: RefinementParameters,
+    limits: PairLimits | None = None,
 ) -> Edges:
-    """One Gauss-Newton step of every pair on its own, as edges from the second scan to the first."""
+    """One Gauss-Newton step of every pair on its own, as edges from the second scan to the first.
+
+    With limits only those count that the arcs allow, and with which the scans agree better than before the refinement.
+    """
     first, second = pairs.rows.T
     relative = se2.between(poses[second], poses[first])
     information, gradient, share = normal_equations(
         surfaces, first, surfaces, second, relative, gate, weighting_from_options(options), stride
     )
-    overlaps = share >= pairs.min_share
-    information = information[overlaps] + _PRIOR_INFORMATION
-    step = -np.linalg.solve(information, gradient[overlaps, :, None])[..., 0]
-    measured = se2.compose(relative[overlaps], se2.exp(step))
-    return Edges(second[overlaps], first[overlaps], measured, np.linalg.inv(information))
+    information += _PRIOR_INFORMATION
+    step = -np.linalg.solve(information, gradient[..., None])[..., 0]
+    measured = se2.compose(relative, se2.exp(step))
+    counts = share >= pairs.min_share
+    if limits is not None:
+        offset = se2.log(se2.between(limits.relative, measured))
+        counts &= np.einsum("mi,mij,mj->m", offset, limits.information, offset) <= _GATE
+        before, after = (_agreement(surfaces, pairs, at, gate, stride, options) for at in (limits.relative, measured))
+        counts &= after >= before
+    return Edges(second[counts], first[counts], measured[counts], _invert(information[counts]))
 
 
-def _concatenate_edges(motion: Edges, registered: Edges) -> Edges:
+def concatenate_edges(motion: Edges, registered: Edges) -> Edges:
+    """The edges of both."""
     return Edges(
         np.concatenate((motion.sources, registered.sources)),
         np.concatenate((motion.targets, registered.targets)),

@@ -15,19 +15,24 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.configuration.topology import RefinementParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import Edges
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs, uninformative_belief
 from hmt_slam_ros.logs import Log
+from hmt_slam_ros.loop_closure.closure_refinement import arc_edges, stack_edges
 from hmt_slam_ros.loop_closure.joint_refinement import (
     add_distant_pairs,
     certain_areas,
+    concatenate_edges,
     linked_areas,
     nearest_keyframes,
+    pair_limits,
     refine_jointly,
     scan_pairs,
+    total_agreement,
 )
+from hmt_slam_ros.messages.messages import Notice
 from hmt_slam_ros.registration.scan_to_scan import (
     ScanSurfaces,
     extract_surfaces,
@@ -43,6 +48,9 @@ from hmt_slam_ros.sensors.scan import SweepCheck
 
 _ITERATIONS = 2
 """Gauss-Newton steps of a scan: metric SLAM has matched it already."""
+
+_INCONSISTENCY_GATE = chi_square_gate(0.999)
+"""Squared Mahalanobis distance from an arc above which a refined pose contradicts it."""
 
 _BATCH = 500
 """Scans whose surfaces are in memory at once."""
@@ -134,6 +142,7 @@ def final_map(recording: Recording, scans: Iterable[Scan], configuration: Config
         return FinalMap(recording, stages)
     refinement = _KeyframeRefinement(recording, configuration)
     refined = _with_keyframe_poses(recording, refinement.refined_poses(recording))
+    refined = replace(refined, notices=recording.notices + _inconsistent_arcs(recording.hybrid_map, refined.hybrid_map))
     stages["keyframes"] = refined.trajectory
     trajectory = refinement.registered_trajectory(refined, scans)
     relative = refined.relative_trajectory.with_trajectory(
@@ -172,16 +181,26 @@ class _KeyframeRefinement:
         return nearest_keyframes(poses, self.areas, seen_from, areas, self._linked, self._options.reach, count)
 
     def refined_poses(self, recording: Recording) -> dict[int, NDArray[np.float64]]:
-        """{keyframe: ``map_T_base``} by joint refinement; the first keyframe is fixed."""
-        poses = self._poses(recording)
+        """{keyframe: ``map_T_base``} by joint refinement; the first keyframe is fixed.
+
+        A registration counts where the arcs allow it and its two scans agree better than before. The result counts
+        where all scans together agree better.
+        """
+        hybrid_map, poses = recording.hybrid_map, self._poses(recording)
         # One more neighbor, since each keyframe is the nearest to itself.
         around = self._neighbor_rows(poses, poses, self.areas, self._options.neighbors + 1)
         near = scan_pairs(around, self._options.min_share)
-        certain = certain_areas(recording.hybrid_map, self._options.first_gate)
+        certain = certain_areas(hybrid_map, self._options.first_gate)
         pairs = add_distant_pairs(near, self._surfaces, poses, self.areas, certain, self._options)
-        motion = self._motion_edges(recording, poses)
-        refined = refine_jointly(self._surfaces, poses, pairs, motion, self._options)
-        return dict(zip(self.ids, refined, strict=True))
+        arcs = stack_edges(arc_edges(hybrid_map, hybrid_map.area_ids()), self.ids)
+        edges = concatenate_edges(self._motion_edges(recording, poses), arcs)
+        area_T_keyframe = np.array(
+            [hybrid_map.keyframes(area)[k] for k, area in zip(self.ids, self.areas.tolist(), strict=True)]
+        )
+        limits = pair_limits(hybrid_map, poses, pairs, self.areas, area_T_keyframe)
+        refined = refine_jointly(self._surfaces, poses, pairs, edges, self._options, limits=limits)
+        before, after = (total_agreement(self._surfaces, at, pairs, self._options) for at in (poses, refined))
+        return dict(zip(self.ids, refined if after > before else poses, strict=True))
 
     def _motion_edges(self, recording: Recording, poses: NDArray[np.float64]) -> Edges:
         """Edges from each keyframe to the next: the motion by metric SLAM, with the covariance of the odometry.
@@ -251,6 +270,28 @@ def _with_keyframe_poses(recording: Recording, poses: Mapping[int, NDArray[np.fl
         replica=replica,
         area_poses=area_poses,
         trajectory=trajectory_in_map(recording.relative_trajectory, poses),
+    )
+
+
+def _inconsistent_arcs(before: HybridMap, after: HybridMap) -> tuple[Notice, ...]:
+    """What the refinement moved by more than the arcs allow: a sentence on the worst of these arcs, if there is one."""
+    moved = []
+    for a, b, arc in before.all_arcs():
+        refined = after.arc(a, b)
+        assert refined is not None
+        squared = arc.pose.mahalanobis2(PoseGaussian.from_pose(refined.mean))
+        if squared > _INCONSISTENCY_GATE:
+            moved.append((squared, a, b, se2.between(arc.pose.mean, refined.mean)))
+    if not moved:
+        return ()
+    _, a, b, offset = max(moved, key=lambda each: each[0])
+    distance, turn = float(np.hypot(offset[0], offset[1])), abs(math.degrees(offset[2]))
+    return (
+        Notice(
+            "refinement",
+            f"area {b} moved by {distance:.2f} m and {turn:.1f} degrees as seen from area {a}, more than their arc "
+            f"allows (one of {len(moved)} such arcs): the map may be wrong there, look at it in map.png",
+        ),
     )
 
 
