@@ -162,10 +162,16 @@ def _make_case(
     return Case(log, 0, "", (*run_of_set.changes, *changes), run_of_set.duration, source=source)
 
 
+_TOPOLOGY_COLUMNS = 11
+"""Columns of pmf.csv about topologies; those after them are about particles."""
+
+
 def digests_of(folder: Path) -> Digests:
     """The digests of an output folder."""
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-    events = list(csv.reader(io.StringIO((folder / "pmf.csv").read_text(encoding="utf-8"))))
+    events = [
+        row[:_TOPOLOGY_COLUMNS] for row in csv.reader(io.StringIO((folder / "pmf.csv").read_text(encoding="utf-8")))
+    ]
     closures = [[*row[:1], *row[3:5], *row[7:10]] for row in events[1:]]
     counts = [report[name] for name in ("keyframes", "areas", "arcs", "loop_closures")]
     return {

@@ -183,7 +183,7 @@ def _recorder_fields(keyframes: Sequence[int]) -> dict[str, Any]:
     stamps, poses = _stamp(keyframes[0]) + _PERIOD * scans, np.zeros((scans.size, 3))
     each = zip(np.split(scans, len(keyframes)), np.split(stamps, len(keyframes)), keyframes, strict=True)
     rows = [
-        TopologyProbability(event, 0, 0.0, FIRST_HYPOTHESIS, FIRST_HYPOTHESIS, 1.0, 0, 1, 0, True, 0.0)
+        TopologyProbability(event, 0, 0.0, FIRST_HYPOTHESIS, FIRST_HYPOTHESIS, 1.0, 0, 1, 0, True, 0.0, 12.0, 1)
         for event in keyframes
     ]
     return {

@@ -64,7 +64,15 @@ def keyframe(sequence: int, children: dict[int, int]) -> Keyframe:
     index = EVERY * sequence
     estimates = tuple(
         HypothesisEstimate(
-            hypothesis, area, belief(se2.between(frame(area), TRUTH[index])), True, 0.0, 0.0, Clutter(), 12.0
+            hypothesis,
+            area,
+            belief(se2.between(frame(area), TRUTH[index])),
+            True,
+            0.0,
+            0.0,
+            Clutter(),
+            12.0 - sequence,
+            mode_count=2 if sequence == CUT else 1,
         )
         for hypothesis, area in children.items()
     )
@@ -253,6 +261,10 @@ def test_the_probabilities_are_those_of_tsbi(folder: Path) -> None:
     assert table["closures"][at_cut].tolist() == [1, 0]
     assert table["parent"][at_cut].tolist() == [0, 0]
     assert table["unexamined"][table["keyframe"] == VERDICT].tolist() == [0.01, 0.01]
+    # Those of the particles of the parent.
+    assert table["effective_samples"][at_cut].tolist() == [12.0 - CUT] * 2
+    assert table["mode_count"][at_cut].tolist() == [2, 2]
+    assert table["mode_count"][~at_cut].max() == 1
     accepted_rows = np.flatnonzero(table["accepted"])
     assert [(table["keyframe"][r], table["hypothesis"][r]) for r in accepted_rows] == [(VERDICT, 1)]
 
@@ -272,6 +284,8 @@ def test_the_report_counts_what_happened(folder: Path) -> None:
     assert report["keyframes"] == report["keyframe_events"] == SCANS // EVERY
     assert report["processes"]["slam"]["max_ms_per_scan"] == pytest.approx(23.0)
     assert report["processes"]["slam"]["mean_ms_per_scan"] == pytest.approx(11.5)
+    particles = {"least_effective_samples": 13.0 - SCANS // EVERY, "most_modes": 2, "events_with_several_modes": 1}
+    assert report["particles"] == particles
     assert report["configuration"]["local_map"]["cell"] == 0.1
     assert (report["seed"], report["peak_rss_bytes"]) == (7, {"hmt_slam": 10**8})
     assert report["notices"] == [{"process": "slam", "text": "two scans had no beam: clean the laser"}]
@@ -309,6 +323,7 @@ def test_the_saved_map_reads_back_complete(folder: Path) -> None:
 def test_the_saved_map_keeps_every_live_hypothesis(tmp_path: Path) -> None:
     recorder = make_recorder()
     for k in range(VERDICT, SCANS // EVERY):
+        recorder.keyframes[k] = keyframe(k, {1: 1, 2: 0})
         recorder.hypotheses[k] = Hypotheses(k, (Hypothesis(1, 1, 0.6, 1), Hypothesis(2, 2, 0.4, 0)))
         recorder.decisions[k] = ClosureDecision(k)
     write(tmp_path, recorder)
@@ -323,6 +338,7 @@ def test_the_saved_map_keeps_that_a_hypothesis_lacks_an_arc(tmp_path: Path) -> N
     recorder = make_recorder()
     moved, arc = MovedKeyframe(VERDICT, 1, 2, np.zeros(3)), PoseGaussian(np.ones(3), 0.01 * np.eye(3))
     for k in range(VERDICT, SCANS // EVERY):
+        recorder.keyframes[k] = keyframe(k, {1: 1, 2: 0})
         changes: dict[str, Any] = {}
         if k == VERDICT:
             arcs = Arc(0, 2, arc), Arc(1, 2, arc)

@@ -153,6 +153,7 @@ def assert_health(health):
     assert set(reported) == {*PROCESSES, "robot", "view"}
     assert {"memory", "peak memory", "busy", "last error"} <= set.intersection(*map(set, reported.values()))
     assert float(reported["slam"]["effective samples"].removesuffix(" of 12")) >= 1.0
+    assert 1 <= int(reported["slam"]["modes of the pose"]) <= 4
     assert float(reported["slam"]["memory"].removesuffix(" MB")) > 20.0
     values = [value for array in health for status in array.status for value in status.values]
     assert max(float(value.value) for value in values if value.key == "sent Scan a second") > 1.0

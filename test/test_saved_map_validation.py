@@ -45,7 +45,7 @@ for part in (*PARTS.values(), MapDocument, ChainState, ScanTable):
     records_of(part, RECORDS)
 
 
-FORM = (19, "76a9f2bc5841c4d5")
+FORM = (20, "cbebbc43dbf46146")
 """Version of the format, and the digest of all fields and types: a change of one is a change of both."""
 
 

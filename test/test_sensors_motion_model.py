@@ -231,6 +231,17 @@ def test_two_sources_tell_of_one_motion():
         np.testing.assert_allclose(both.covariance, 0.75e-4 * np.eye(3), atol=1e-12)
 
 
+def test_a_heading_is_no_less_certain_than_one_of_which_nothing_is_known():
+    covariance = np.array([[4.0, 0.0, 6.0], [0.0, 1.0, 0.0], [6.0, 0.0, 36.0]])
+    bounded = RelativeMotion(np.ones(3), covariance).bound_heading()
+    assert bounded.covariance[2, 2] == pytest.approx(np.pi**2 / 3.0)
+    np.testing.assert_array_equal(bounded.covariance[:2, :2], covariance[:2, :2])
+    # The correlation stays.
+    assert bounded.covariance[0, 2] / np.sqrt(4.0 * bounded.covariance[2, 2]) == pytest.approx(0.5)
+    certain = RelativeMotion(np.ones(3), 1e-4 * np.eye(3))
+    np.testing.assert_array_equal(certain.bound_heading().covariance, certain.covariance)
+
+
 def test_a_pose_is_wide_where_its_heading_is_or_its_position_in_all_directions():
     settings = FilterParameters(keyframe_distance=0.5, keyframe_angle=20.0)
 

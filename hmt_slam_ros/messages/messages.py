@@ -50,6 +50,7 @@ class HypothesisEstimate:
     :ivar effective_samples: ESS of the hypothesis's particles, in [1, number of particles].
     :ivar revised_keyframes: earlier keyframes of the area whose pose changed because another particle leads now;
         ``previous_area`` and ``area`` are equal.
+    :ivar mode_count: number of modes of the pose among the particles.
     """
 
     hypothesis: int
@@ -61,6 +62,7 @@ class HypothesisEstimate:
     clutter: Clutter
     effective_samples: float
     revised_keyframes: tuple[MovedKeyframe, ...] = ()
+    mode_count: int = 1
 
 
 @dataclass(frozen=True, eq=False, slots=True)

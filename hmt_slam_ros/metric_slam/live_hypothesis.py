@@ -217,6 +217,7 @@ class LiveHypothesis:
             self.filter.clutter_estimate.clutter,
             step.effective_samples,
             self._revised_keyframes(sequence) if step.keyframes_moved and may_store else (),
+            step.mode_count,
         )
 
     def _scan_evidence(self, prepared: PreparedScan) -> ScanEvidence:

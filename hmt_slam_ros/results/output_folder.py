@@ -255,6 +255,11 @@ def build_report(recording: Recording, configuration: Configuration, figures: Ru
             "most_probable": replica.best_hypothesis,
             "probability": replica.probabilities[replica.best_hypothesis],
         },
+        "particles": {
+            "least_effective_samples": min(row.effective_samples for row in recording.probabilities),
+            "most_modes": max(row.mode_count for row in recording.probabilities),
+            "events_with_several_modes": len({row.keyframe for row in recording.probabilities if row.mode_count > 1}),
+        },
         "notices": [{"process": notice.process, "text": notice.text} for notice in recording.notices],
         "processes": {name: _cost_summary(seconds) for name, seconds in figures.seconds_per_scan.items()},
         "peak_rss_bytes": dict(figures.peak_rss),

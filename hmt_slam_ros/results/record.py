@@ -31,6 +31,8 @@ class TopologyProbability(NamedTuple):
     closures: int
     accepted: bool
     unexamined: float
+    effective_samples: float
+    mode_count: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +64,8 @@ class ProbabilityTable(Table):
     :ivar closures: number of arcs that closed a loop.
     :ivar accepted: whether TLCA made the hypothesis definite at this event.
     :ivar unexamined: probability of the topologies that are not among the hypotheses.
+    :ivar effective_samples: ESS of the particles of the hypothesis that it continues.
+    :ivar mode_count: number of modes of the pose among them.
     """
 
     keyframe: Int64
@@ -75,6 +79,8 @@ class ProbabilityTable(Table):
     closures: Int64
     accepted: Bool
     unexamined: Float64
+    effective_samples: Float64
+    mode_count: Int64
 
     @classmethod
     def from_rows(cls, rows: Iterable[TopologyProbability] = ()) -> ProbabilityTable:

@@ -283,6 +283,7 @@ def _replay(
         replica.add_keyframe(keyframe)
         successors |= _successors(replica, message.pruned_keyframes)
         replica.apply_hypotheses(message)
+        estimates = {estimate.hypothesis: estimate for estimate in keyframe.estimates}
         sizes = {h.id: _map_size(replica, h, sizes) for h in message.hypotheses}
         probabilities += [
             TopologyProbability(
@@ -296,6 +297,8 @@ def _replay(
                 *sizes[h.id],
                 h.id == decision.hypothesis,
                 message.unexamined,
+                estimates[h.parent].effective_samples,
+                estimates[h.parent].mode_count,
             )
             for h in message.hypotheses
         ]

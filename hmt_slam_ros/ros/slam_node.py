@@ -369,15 +369,16 @@ class SlamNode(MapServicesNode):
             if isinstance(output, LocalEstimate):
                 self.estimate = output
             if isinstance(output, Keyframe):
-                self._report_effective_samples(output)
+                self._report_particles(output)
                 self._publish_particles(output.scan.stamp)
 
-    def _report_effective_samples(self, keyframe: Keyframe) -> None:
+    def _report_particles(self, keyframe: Keyframe) -> None:
         best = self.process.replica.best_hypothesis
         for estimate in keyframe.estimates:
             if estimate.hypothesis == best:
                 particles = len(self.process.particles[1])
                 self.diagnostics.values["effective samples"] = f"{estimate.effective_samples:.1f} of {particles}"
+                self.diagnostics.values["modes of the pose"] = str(estimate.mode_count)
 
     def _publish_particles(self, stamp: int) -> None:
         area, poses = self.process.particles

@@ -84,8 +84,8 @@ _SHAPES: Mapping[str, Mapping[str, str]] = {
         "tables": "m t t",
         "predicted_poses": "m 3",
         "last_poses": "m 3",
+        "members": "m",
         "tracking_covariance": "3 3",
-        "residual_covariance": "3 3",
     },
     "PatchState": {"odds": "n 32 32", "field": "n 32 32", "occupied": "n 32"},
     "PathPose": {"pose": "3"},
@@ -105,6 +105,8 @@ _SHAPES: Mapping[str, Mapping[str, str]] = {
             "closures",
             "accepted",
             "unexamined",
+            "effective_samples",
+            "mode_count",
         ),
         "n",
     ),
@@ -132,6 +134,7 @@ _SHAPES: Mapping[str, Mapping[str, str]] = {
         "partial_beams": "c",
         "partial_starts": "c",
     },
+    "TrackedMode": {"residual_covariance": "3 3"},
     "WallLine": {"segments": "w 2"},
 }
 """{class: {field: sizes}}: a size is a number, or a letter that stands for the same size in the whole record."""
@@ -159,6 +162,7 @@ _LIMITS: Mapping[str, tuple[float, float]] = {
     **dict.fromkeys(("processed_scans", "dropped_scans", "first_unpublished_scan", "next_hypothesis"), _NUMBER),
     **dict.fromkeys(("peak_patches", "leader", "detections", "misses", "sightings", "next_number", "sizes"), _NUMBER),
     **dict.fromkeys(("scan_index", "dropped", "separation_count", "dominant_keyframes", "change_count"), _NUMBER),
+    **dict.fromkeys(("members", "mode_count"), _NUMBER),
     **dict.fromkeys(("unreported", "beams", "hypothesis", "graph", "map_sizes", "checksum"), _NUMBER),
     **dict.fromkeys(("keyframes", "keyframe", "event", "id", "parent", "hypotheses", "since"), _NUMBER_OR_NONE),
     **dict.fromkeys(
@@ -174,7 +178,7 @@ _LIMITS: Mapping[str, tuple[float, float]] = {
     ),
     **dict.fromkeys(("inliers", "outliers", "distance", "angle", "periods", "last_interval", "min_ncut"), _POSITIVE),
     "kind": (0, 2),
-    **dict.fromkeys(("long_term_period", "recent_period", "negative_shares"), _POSITIVE),
+    **dict.fromkeys(("long_term_period", "recent_period", "negative_shares", "effective_samples"), _POSITIVE),
 }
 """{field of any record: smallest and largest value of its numbers}."""
 

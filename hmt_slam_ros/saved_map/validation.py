@@ -122,6 +122,9 @@ def _check_particles(state: Any, path: str) -> None:  # noqa: ANN401
     require(state.log_weights.size > 0, f"{path}.log_weights", "empty", "of one particle or more")
     require(state.leader < state.log_weights.size, f"{path}.leader", state.leader, "one of the particles")
     require(bool((state.log_weights <= SYMMETRY).all()), f"{path}.log_weights", state.log_weights.max(), "0 or less")
+    modes = np.unique(state.members)
+    every = np.arange(len(state.modes))
+    require(np.array_equal(modes, every), f"{path}.members", modes, f"of each of the {every.size} modes")
     require(bool((state.tables >= -1).all()), f"{path}.tables", state.tables.min(initial=0), "-1 or more")
     _check_local_keyframes(state, state.keyframe_poses.shape[1], path)
 

@@ -14,6 +14,9 @@ from hmt_slam_ros.geometry.gaussian import matrix_inverse, propagate_covariance
 
 _DEGREES, _RADIANS = 180.0 / math.pi, math.pi / 180.0
 
+_ANY_HEADING = math.pi / math.sqrt(3.0)
+"""Deviation of a heading of which nothing is known, rad."""
+
 Length = TypeVar("Length", float, Float64)
 
 
@@ -38,6 +41,11 @@ class RelativeMotion(NamedTuple):
         difference = se2.log(se2.between(self.increment, other.increment))
         increment = se2.compose(self.increment, se2.exp(gain @ difference))
         return RelativeMotion(increment, self.covariance - gain @ self.covariance)
+
+    def bound_heading(self) -> RelativeMotion:
+        """The same motion, with a heading no less certain than one of which nothing is known."""
+        scale = np.array([1.0, 1.0, _ANY_HEADING / max(_ANY_HEADING, math.sqrt(self.covariance[2, 2]))])
+        return self._replace(covariance=self.covariance * np.outer(scale, scale))
 
 
 NO_MOTION = RelativeMotion(np.zeros(3), np.zeros((3, 3)))

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from hmt_slam_ros.arrays import Float64, Int32
+from hmt_slam_ros.arrays import Float64, Int32, Int64
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.registration.consistency import ClutterEstimate, MapAgreement
 from hmt_slam_ros.registration.match_covariance import MatchError
@@ -15,6 +15,24 @@ from hmt_slam_ros.sensors.motion_model import Prediction
 from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 from hmt_slam_ros.submap.line_map_state import LineMapState
 from hmt_slam_ros.submap.local_mapping import PreparedScan
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedMode:
+    """A mode of the pose, whose particles are matched together between two filter steps.
+
+    :ivar motion_since_update: the predicted motion since the last filter step.
+    :ivar residual_covariance: of the pose after the scans since the last filter step, shape (3, 3), right tangent
+        frame.
+    :ivar counted_evidence: of matches since the last filter step, in the weights until the next one, which counts that
+        of its own scan, nats.
+    :ivar shows_map: whether the last scan showed anything of the map.
+    """
+
+    motion_since_update: RelativeMotion
+    residual_covariance: Float64
+    counted_evidence: float = 0.0
+    shows_map: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +50,11 @@ class ParticleFilterState:
         seen; the origin is the corner between the four middle patches.
     :ivar predicted_poses: shape (M, 3), the poses as predicted by odometry and inertia since the last filter step.
     :ivar last_poses: shape (M, 3), the poses at the last filter step.
-    :ivar motion_since_update: the predicted motion since the last filter step.
+    :ivar modes: the modes between which the weights have yet to decide, mostly one.
+    :ivar members: shape (M,), number of the mode of each particle.
     :ivar leader: number of the particle whose pose is the filter's.
-    :ivar tracking_covariance: of the leader's motion since the last filter step, shape (3, 3), right tangent frame.
-    :ivar residual_covariance: of the leader's pose after the scans since the last filter step, shape (3, 3), right
-        tangent frame.
+    :ivar tracking_covariance: of the motion since the last filter step, under all modes, shape (3, 3), right tangent
+        frame.
     :ivar clutter_estimate: usual contradictions of scans so far.
     """
 
@@ -50,10 +68,10 @@ class ParticleFilterState:
     tables: Int32
     predicted_poses: Float64
     last_poses: Float64
-    motion_since_update: RelativeMotion
+    modes: tuple[TrackedMode, ...]
+    members: Int64
     leader: int
     tracking_covariance: Float64
-    residual_covariance: Float64
     clutter_estimate: ClutterEstimate
 
 
@@ -120,6 +138,7 @@ class FilterStep:
     :ivar information: of the match alone, for correlated beams, in the frame of the pose, shape (3, 3).
     :ivar effective_samples: ESS before resampling.
     :ivar keyframes_moved: whether keyframe poses differ from those published.
+    :ivar mode_count: number of modes of the pose.
     """
 
     increment: Float64
@@ -127,6 +146,7 @@ class FilterStep:
     information: Float64
     effective_samples: float
     keyframes_moved: bool
+    mode_count: int = 1
 
 
 class LocalFilter(Protocol):
