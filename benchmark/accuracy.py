@@ -69,7 +69,12 @@ class Bound:
     rotation: float
 
 
-BOUNDS = {"aces": Bound(0.043, 0.9), "intel": Bound(0.022, 0.8)}
+BOUNDS = {
+    "aces": Bound(0.043, 0.9),
+    "intel": Bound(0.022, 0.8),
+    "csail": Bound(0.0319, 0.9),
+    "hospital": Bound(0.10, 0.9),
+}
 
 
 def measure_accuracy(settings: Settings) -> Report:

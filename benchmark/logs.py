@@ -25,6 +25,7 @@ _FILES = {
     "aces": ("aces.clf.xz", "aces.relations.xz"),
     "intel": ("intel.clf.xz", "intel.relations.xz"),
     "csail": ("csail.clf.xz", "csail.relations.xz"),
+    "hospital": ("hospital.clf.xz", "hospital.relations.xz"),
     "edmonton": ("edmonton.kf.clf.xz", None),
     "freiburg-101": ("freiburg-101.kf.clf.xz", None),
 }
