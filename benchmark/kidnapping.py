@@ -126,6 +126,7 @@ class MonitoredRun:
         self.run = LockStepRun(load_configuration(PARAMETERS, list(changes)))
         self.true: dict[int, NDArray[np.float64]] = {}
         self.kidnap_event = -1
+        self._truth: dict[int, NDArray[np.float64]] = {}
 
     @property
     def events(self) -> int:
@@ -176,13 +177,21 @@ class MonitoredRun:
                 return {entry.area: entry.pose.mean for entry in decisions[sequence].global_poses}
         return {}
 
-    def report(self, true: NDArray[np.float64], traveled: float) -> LocalizationReport | None:
-        """The report at a keyframe event after the kidnapping; None for other scans."""
-        if self.events - 1 in self.true:
+    def report(self, stamp: int, true: NDArray[np.float64], traveled: float) -> LocalizationReport | None:
+        """The report at a keyframe event after the kidnapping; None for other scans.
+
+        Scans may have waited for odometry, so there may be several events since the last scan.
+
+        :param stamp: of the scan, ns.
+        :param true: ``world_T_base``, shape (3,), at the scan.
+        """
+        self._truth[stamp] = true
+        new = range(len(self.true), self.events)
+        for event in new:
+            self.true[event] = self._truth[self.run.recorder.keyframes[event].scan.stamp]
+        if not new or self.kidnap_event < 0:
             return None
-        self.true[self.events - 1] = true
-        if self.kidnap_event < 0:
-            return None
+        true = self.true[self.events - 1]
         return LocalizationReport(traveled, self.lost_probability() <= LOST_LIMIT, self.is_sure(), self.is_right(true))
 
 
@@ -204,7 +213,7 @@ def drive_kidnapped(name: str, changes: Sequence[str] = ()) -> Kidnapping:
         stamps.append(record.measurement.stamp)
         truth.append(record.true_pose)
         parts.append(monitored.kidnap_event >= 0)
-        report = monitored.report(record.true_pose, traveled)
+        report = monitored.report(record.measurement.stamp, record.true_pose, traveled)
         reports += [] if report is None else [report]
     result = monitored.run.finish()
     recording = result.recorder.finish(result.log_progress.stamps)
