@@ -99,8 +99,20 @@ def test_the_grids_that_are_kept_take_bounded_memory(views):
     assert views.grid({0: np.zeros(3)}) is first
     for k in range(40):
         views.grid({0: np.array([0.0, 0.0, 0.05 * k])})
-    assert sum(grid.nbytes for grid in views._grids.values()) <= KEPT
+    assert sum(size for _, size in views._grids._grids.values()) <= KEPT
     assert views.grid({0: np.zeros(3)}) is not first
+
+
+def test_a_coarse_grid_outlasts_the_grid_that_it_was_made_of(views):
+    grid, coarse = views.grid({0: np.zeros(3)}), views.coarse_grid({0: np.zeros(3)})
+    assert coarse.log_ratio is grid.log_ratio
+    assert (coarse.origin is grid.origin, coarse.cell) == (True, grid.cell)
+    for k in range(40):
+        views.grid({0: np.array([0.0, 0.0, 0.05 * k])})
+    assert views.grid({0: np.zeros(3)}) is not grid
+    assert views.coarse_grid({0: np.zeros(3)}) is coarse
+    views.clear()
+    assert views.coarse_grid({0: np.zeros(3)}) is not coarse
 
 
 def test_the_grids_that_are_kept_are_forgotten_when_they_are_needed_no_more(views):

@@ -11,12 +11,13 @@ from worlds import box, scan_in
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.registration import area_to_area, match_modes
-from hmt_slam_ros.registration.area_to_area import MatchSettings, match_areas
+from hmt_slam_ros.registration.area_to_area import MatchSettings, find_cells, match_areas
 from hmt_slam_ros.registration.branch_and_bound import SearchCells, constrain_around
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 
 MODEL = GridModel()
+HERE = np.array([True])
 SETTINGS = MatchSettings()
 ROOM = np.concatenate(
     (box(0.0, 0.0, 8.0, 6.0), box(2.0, 1.5, 3.0, 2.5), box(5.0, 4.0, 6.5, 4.5), np.array([[4.0, 0.0, 4.0, 1.2]]))
@@ -55,21 +56,24 @@ def prior_around(truth, sigma, degrees, offset=(0.6, -0.8, 0.5)):
     return PoseGaussian(se2.compose(truth, spread * offset), np.diag(spread**2))
 
 
+def match_around(visit, known_area, prior, positions, keyframes):
+    constraint = constrain_around(positions, HERE, keyframes, 0.5, known_area.cell)
+    surface = LogRatioGrid(known_area.log_ratio, known_area.origin, known_area.cell)
+    cells = find_cells(visit, surface, known_area.points, prior, SETTINGS, constraint=constraint)
+    return match_areas(visit, known_area, prior, SETTINGS, cells=cells)
+
+
 def test_poses_where_no_keyframe_is_on_the_ground_are_not_searched(known_area, visit):
     prior, at = prior_around(TRUTH, 1.0, 6.0), TRUTH[None, :2]
     keyframes = np.array([[0.0, 0.0], [50.0, 50.0]])
     free = match_areas(visit, known_area, prior, SETTINGS)
-    inside = match_areas(
-        visit, known_area, prior, SETTINGS, constraint=constrain_around(at, keyframes, 0.5, known_area.cell)
-    )
+    inside = match_around(visit, known_area, prior, at, keyframes)
     assert inside.modes[0].pose.mean == pytest.approx(free.modes[0].pose.mean, abs=1e-9)
     assert inside.log_evidence <= free.log_evidence
-    beside = match_areas(
-        visit, known_area, prior, SETTINGS, constraint=constrain_around(at + 1.0, keyframes, 0.5, known_area.cell)
-    )
+    assert 0 < inside.work < free.work
+    beside = match_around(visit, known_area, prior, at + 1.0, keyframes)
     assert all(np.hypot(*(mode.pose.mean[:2] - TRUTH[:2] - 1.0)) < 0.8 for mode in beside.modes)
-    nowhere = constrain_around(at + 30.0, keyframes[:1], 0.5, known_area.cell)
-    assert match_areas(visit, known_area, prior, SETTINGS, constraint=nowhere).modes == ()
+    assert match_around(visit, known_area, prior, at + 30.0, keyframes[:1]).modes == ()
 
 
 def test_poses_beyond_the_bounds_are_not_searched(known_area, visit):

@@ -35,12 +35,35 @@ from hmt_slam_ros.registration.search_bounds import (
 
 def test_a_constraint_admits_the_cells_within_the_radius_of_a_position_anywhere_in_them():
     known = np.random.default_rng(3).uniform([-4.0, 1.0], [2.0, 4.0], (5, 2))
-    allowed = constrain_around(known, np.zeros((1, 2)), 0.7, 0.2).allowed
+    is_searched = np.array([False, True, False, False, True])
+    allowed = constrain_around(known, is_searched, np.zeros((1, 2)), 0.7, 0.2).allowed
     rows, columns = allowed.log_ratio.shape
     # And none beyond the grid.
     x, y = (allowed.origin[k] + 0.2 * (np.arange(-1, size + 1) + 0.5) for k, size in enumerate((columns, rows)))
-    away = np.hypot(x[None, :, None] - known[:, 0], y[:, None, None] - known[:, 1]).min(axis=2)
-    np.testing.assert_array_equal(np.pad(allowed.log_ratio, 1) > 0.0, away <= 0.9)
+    near = np.hypot(x[None, :, None] - known[:, 0], y[:, None, None] - known[:, 1]) <= 0.9
+    expected = np.where(near[..., is_searched].any(axis=2), 1.0, 0.5 * near.any(axis=2))
+    np.testing.assert_array_equal(np.pad(allowed.log_ratio, 1), expected)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_half_of_the_keyframes_have_to_be_near_positions_and_one_near_a_searched_one(seed):
+    rng = np.random.default_rng(seed)
+    known, is_searched = rng.uniform(-1.0, 1.0, (4, 2)), np.array([True, False, False, False])
+    keyframes = rng.uniform(-1.0, 1.0, (4 + seed % 2, 2))
+    window = make_search_window(np.zeros(3), np.diag([0.4, 0.4, 0.4]) ** 2, 0.1, 0.2, 9.0)
+    given = constrain_around(known, is_searched, keyframes, 0.4, 0.1)
+    constraint = build_constraint_pyramid(given, window, 2)
+    allowed, found = np.pad(given.allowed.log_ratio, 99), []
+    for k, i, j in rng.integers([0, *window.first], [window.turns.size, *window.last + 1], (200, 3)).tolist():
+        admissible = []
+        for x, y in itertools.product(range(i, i + 4), range(j, j + 4)):
+            column, row = (constraint.keyframes[k] + [x, y] + 99).T
+            values = allowed[row, column]
+            admissible.append(2 * (values > 0.0).sum() >= len(values) and values.max() == 1.0)
+        assert is_admissible(constraint, 0, k, i, j) == admissible[0]
+        assert is_admissible(constraint, 2, k, i, j) or not any(admissible)
+        found.append(admissible[0])
+    assert {False, True} == set(found)
 
 
 @pytest.mark.parametrize("mean", [(0.7, -0.4, 0.6), (-2.0, 1.0, -2.5)])
@@ -179,7 +202,9 @@ def test_of_a_square_the_quarters_are_searched_that_may_hold_a_cell_the_best_fir
     window = make_search_window(rng.uniform(-0.3, 0.3, 3), np.diag([0.4, 0.4, 0.1]) ** 2, 0.1, 0.08, 9.0, limits)
     reverse = make_reverse_check(window, surface, np.zeros((0, 2)))
     constraint = build_constraint_pyramid(
-        constrain_around(rng.uniform(-1.0, 1.0, (3, 2)), rng.uniform(-1.0, 1.0, (2, 2)), 0.3, 0.1), window, 3
+        constrain_around(rng.uniform(-1.0, 1.0, (3, 2)), np.ones(3, bool), rng.uniform(-1.0, 1.0, (2, 2)), 0.3, 0.1),
+        window,
+        3,
     )
     pyramid, cells = build_pyramid(surface.log_ratio, 3), sample_cells(window, surface, samples)
     problem = _SearchProblem(window, surface, pyramid, cells, constraint, reverse, 0.5, 2.0)

@@ -11,15 +11,27 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.registration.area_to_area import MatchMode
-from hmt_slam_ros.registration.consistency import NO_CLUTTER, WALLS_OF_MAP, WALLS_OUTLIER_RATE, Agreement
+from hmt_slam_ros.registration.consistency import (
+    MAP_IN_MAP,
+    MAPS_OUTLIER_RATE,
+    NO_CLUTTER,
+    WALLS_OF_MAP,
+    WALLS_OUTLIER_RATE,
+    Agreement,
+)
+from hmt_slam_ros.topological_inference import global_localization
 from hmt_slam_ros.topological_inference.global_localization import (
     UNMAPPED_PRIOR,
+    GlobalSearch,
     PoseDistribution,
     PoseHint,
+    begin_search,
+    continue_search,
+    is_conclusive,
     localize_globally,
     summarize_localization,
 )
-from hmt_slam_ros.topological_inference.global_scan_matching import GlobalScanMatcher, PoseCandidate
+from hmt_slam_ros.topological_inference.global_scan_matching import GlobalScanMatcher, PoseCandidate, RegionMatch
 
 shares = st.lists(st.floats(0.001, 1.0), min_size=1, max_size=5)
 
@@ -98,12 +110,16 @@ def test_evidence_multiplies_odds_against_unmapped_ground(pairs):
 class GivenWalls(GlobalScanMatcher):
     """Finds one candidate in every area that is searched, each with given walls."""
 
-    def __init__(self, walls):
-        self.walls, self.searched = walls, []
+    def __init__(self, walls, work=0, agreements=None):
+        self.walls, self.work, self.agreements = walls, work, agreements or {}
+        self.searched, self.best_shares = [], []
 
-    def match_regions(self, _hybrid_map, _poses, _before, area_probabilities):
-        self.searched = list(area_probabilities)
-        return list(map(make_candidate, area_probabilities))
+    def match_region(self, _hybrid_map, _poses, _before, unexamined, best_share):
+        area = max(unexamined, key=unexamined.get)
+        self.searched.append(area)
+        self.best_shares.append(best_share)
+        found = make_candidate(area)._replace(agreement=self.agreements.get(area, Agreement(0, 0, 0)))
+        return RegionMatch(frozenset({area}), frozenset({area, area + 1}), (found,), self.work)
 
     def check_walls(self, _hybrid_map, candidate, _poses, _before):
         return self.walls[candidate.area]
@@ -112,12 +128,55 @@ class GivenWalls(GlobalScanMatcher):
 def test_walls_that_beams_pass_count_against_a_candidate_and_others_count_for_none():
     passed = Agreement(400, 360, 40)
     matcher = GivenWalls({0: Agreement(400, 400, 0), 1: passed, 2: Agreement(0, 0, 0)})
-    found = localize_globally(matcher, dict.fromkeys(range(3), 1.0 / 3.0), 0.01, HybridMap(), {}, 9, NO_CLUTTER)
+    search = GlobalSearch({}, 9, 3, {}, tuple(map(make_candidate, range(3))))
+    found = localize_globally(search, matcher, 0.01, HybridMap(), NO_CLUTTER)
     log_ratio = WALLS_OF_MAP.log_likelihood_ratio(passed, WALLS_OUTLIER_RATE)
     assert log_ratio < -1.0
     first, second, third = found.probabilities
     assert second / first == pytest.approx(math.exp(log_ratio))
     assert third == pytest.approx(first)
+
+
+def map_of(areas):
+    hybrid_map = HybridMap()
+    for area in range(areas):
+        hybrid_map.set_keyframe(area, area, np.zeros(3))
+    return hybrid_map
+
+
+def test_an_event_searches_the_most_probable_regions_until_its_work_is_done():
+    work = global_localization._EVENT_WORK // 2
+    matcher = GivenWalls({}, work, {3: Agreement(10, 6, 0)})
+    probabilities = {0: 0.05, 1: 0.1, 2: 0.2, 3: 0.4, 4: 0.15, 5: 0.1}
+    search = continue_search(begin_search(map_of(6), {9: np.zeros(3)}, 9, probabilities), matcher, map_of(6), first=1)
+    assert matcher.searched == [1, 3]
+    # Area 2 was merged with another one.
+    hybrid_map = map_of(6)
+    hybrid_map.merge(2, 3, PoseGaussian(np.zeros(3), np.eye(3)))
+    search = continue_search(search, matcher, hybrid_map, first=1)
+    assert matcher.searched == [1, 3, 4, 5]
+    assert matcher.best_shares == [0.0, 0.0, 0.6, 0.6]
+    assert list(search.unexamined) == [0]
+    assert search.fitting_areas == {1, 2, 3, 4, 5, 6}
+    assert [candidate.area for candidate in search.candidates] == [1, 3, 4, 5]
+    assert continue_search(search, matcher, hybrid_map).unexamined == {}
+    assert continue_search(search, GivenWalls({}, 0), hybrid_map).unexamined == {}
+
+
+def test_what_was_not_searched_may_match_as_well_and_the_candidate_by_chance():
+    fit, others = Agreement(400, 400, 0), {0: 0.2, 1: 0.1}
+    candidate = make_candidate(4)._replace(agreement=fit)
+    partial, whole = (GlobalSearch({}, 9, 5, left, (candidate,)) for left in (others, {}))
+    there = MAP_IN_MAP.log_likelihood_ratio(fit, MAPS_OUTLIER_RATE)
+    for search, negatives, unexamined in ((partial, 2, 0.3), (whole, 4, 0.0)):
+        distinctiveness = (2.0 + negatives) / (2.0 * 0.01)
+        weight = 0.8 / 5.0 * math.exp(there) * distinctiveness
+        expected = weight / (weight + UNMAPPED_PRIOR + 0.8 * unexamined * math.exp(there))
+        found = localize_globally(search, GivenWalls({4: Agreement(0, 0, 0)}), 0.01, HybridMap(), NO_CLUTTER)
+        assert found.probabilities.tolist() == pytest.approx([expected])
+        bounds = (expected - 1e-6, expected + 1e-6)
+        conclusive = [is_conclusive(search, 0.01, HybridMap(), NO_CLUTTER, None, bound) for bound in bounds]
+        assert conclusive == [True, not unexamined]
 
 
 @pytest.mark.parametrize("reach", [-0.01, 0.01])
@@ -135,11 +194,10 @@ def test_an_initial_pose_reaches_four_deviations_of_its_least_certain_direction(
     covariance = rotation @ np.diag([0.1, 0.6, 0.2]) ** 2 @ rotation.T
     at = se2.transform(arc, [1.0, -0.5]) + (1.5 + 4.0 * 0.6 - reach) * np.array([0.6, -0.8])
     pose_hint = PoseHint(9, 0, PoseGaussian(np.array([*at, 0.4]), covariance))
-    matcher = GivenWalls(dict.fromkeys(range(3), Agreement(0, 0, 0)))
     # The keyframe of area 2 came when the robot was lost already.
     areas = dict.fromkeys(range(3), 1.0 / 3.0)
-    localize_globally(matcher, areas, 0.01, hybrid_map, {9: np.zeros(3)}, 8, NO_CLUTTER, pose_hint, 1.5)
-    assert matcher.searched == ([1] if reach > 0.0 else [])
+    search = begin_search(hybrid_map, {9: np.zeros(3)}, 8, areas, pose_hint, 1.5)
+    assert list(search.unexamined) == ([1] if reach > 0.0 else [])
 
 
 def test_an_initial_pose_weighs_candidates_by_their_distance_in_both_covariances():
@@ -150,10 +208,10 @@ def test_an_initial_pose_weighs_candidates_by_their_distance_in_both_covariances
     hybrid_map.set_arc(0, 1, arc, closure=False)
     hint = PoseGaussian(np.array([0.4, 0.9, 0.5]), np.array([[0.3, 0.1, 0.0], [0.1, 0.2, 0.02], [0.0, 0.02, 0.1]]))
     matcher = GivenWalls(dict.fromkeys(range(2), Agreement(0, 0, 0)))
-    areas = dict.fromkeys(range(2), 0.5)
-    search = (matcher, areas, 0.01, hybrid_map, {9: np.zeros(3)}, 9, NO_CLUTTER)
+    search = GlobalSearch({9: np.zeros(3)}, 9, 2, {}, tuple(map(make_candidate, range(2))))
     flat, found = (
-        localize_globally(*search, pose_hint, 2.0).probabilities for pose_hint in (None, PoseHint(9, 0, hint))
+        localize_globally(search, matcher, 0.01, hybrid_map, NO_CLUTTER, pose_hint).probabilities
+        for pose_hint in (None, PoseHint(9, 0, hint))
     )
     measured = make_candidate(0).mode.measured
     odds = []
@@ -175,7 +233,6 @@ def test_only_areas_near_an_initial_pose_are_searched(x, y, near):
         if area:
             hybrid_map.set_arc(0, area, PoseGaussian(np.array([*position, 0.0]), 1e-4 * np.eye(3)), closure=False)
     pose_hint = PoseHint(9, 0, PoseGaussian(np.array([x, y, 0.0]), np.diag([0.25, 0.25, 0.1])))
-    matcher = GivenWalls(dict.fromkeys(range(3), Agreement(0, 0, 0)))
     areas = dict.fromkeys(range(3), 1.0 / 3.0)
-    localize_globally(matcher, areas, 0.01, hybrid_map, {9: np.zeros(3)}, 9, NO_CLUTTER, pose_hint, 2.0)
-    assert matcher.searched == near
+    search = begin_search(hybrid_map, {9: np.zeros(3)}, 9, areas, pose_hint, 2.0)
+    assert (list(search.unexamined), search.areas) == (near, len(near))

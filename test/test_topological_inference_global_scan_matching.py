@@ -13,7 +13,7 @@ from hmt_slam_ros.hybrid_map.surroundings import GridCache, Neighborhood
 from hmt_slam_ros.registration.area_to_area import MatchSettings
 from hmt_slam_ros.registration.likelihood_grid import GridModel
 from hmt_slam_ros.topological_inference import global_scan_matching
-from hmt_slam_ros.topological_inference.global_scan_matching import FreeSpaceCheck, GlobalScanMatcher, regions
+from hmt_slam_ros.topological_inference.global_scan_matching import FreeSpaceCheck, GlobalScanMatcher, region_around
 
 REACH = 6.0
 ASKED = se2.compose(np.array([3.6, 2.6, 2.5]), np.array([[0.3 * k, 0.0, 0.05 * k] for k in range(4)]))
@@ -46,7 +46,20 @@ def match(query):
     """Matches the keyframes of ``query`` into areas of the map."""
     hybrid_map, poses, scans = query
     matcher = make_matcher(scans)
-    return lambda areas: matcher.match_regions(hybrid_map, poses, 1000, dict.fromkeys(areas, 1.0 / len(areas)))
+    return lambda areas: match_all(matcher, hybrid_map, poses, 1000, areas)
+
+
+def match_all(matcher, hybrid_map, poses, before, areas):
+    """The candidates in all regions of some areas, the first area's first."""
+    found, unexamined = [], dict.fromkeys(areas, 1.0 / len(areas))
+    while unexamined:
+        best_share = max((fit.agreement.matched_share for fit in found), default=0.0)
+        region = matcher.match_region(hybrid_map, poses, before, unexamined, best_share)
+        assert region.areas
+        assert region.work > 0
+        found += region.candidates
+        unexamined = {area: p for area, p in unexamined.items() if area not in region.areas}
+    return found
 
 
 def position_error(fit):
@@ -64,10 +77,9 @@ def test_a_room_is_recognized_from_anywhere_in_it(match):
 def test_later_keyframes_are_no_part_of_the_map(query):
     hybrid_map, poses, scans = query
     matcher = make_matcher(scans)
-    assert matcher.match_regions(hybrid_map, poses, 0, {0: 1.0}) == []
     for keyframe, pose in poses.items():
         hybrid_map.set_keyframe(keyframe, 2, pose)
-    assert {fit.area for fit in matcher.match_regions(hybrid_map, poses, 12, {0: 0.5, 2: 0.5})} == {0}
+    assert {fit.area for fit in match_all(matcher, hybrid_map, poses, 12, [0])} == {0}
 
 
 def test_a_room_is_recognized_despite_traces_of_people_in_its_map(query, match):
@@ -143,7 +155,10 @@ def test_areas_are_searched_together_where_they_lie_for_certain_beside_each_othe
         if area:
             arc = PoseGaussian(np.array([5.0, 0.0, 0.0]), np.diag([deviation, deviation, 0.01]) ** 2)
             hybrid_map.set_arc(area - 1, area, arc, closure=False)
-    found = regions(hybrid_map, range(6), 10.0)
+    found, unexamined = [], list(range(6))
+    while unexamined:
+        found.append(region_around(hybrid_map, unexamined[0], range(6), unexamined, 10.0))
+        unexamined = [area for area in unexamined if area not in found[-1].own_areas]
     assert sorted(area for part in found for area in part.own_areas) == list(range(6))
     assert len(found) == count
     assert all(part.own_areas <= part.poses.keys() for part in found)
@@ -153,13 +168,13 @@ def test_areas_are_searched_together_where_they_lie_for_certain_beside_each_othe
 
 def test_a_later_region_needs_the_mean_log_ratio_of_a_share_0_15_below_the_best(match, monkeypatch):
     """A known surface makes a sample three times as likely; half of the samples have to be on one at least."""
-    required, search = [], global_scan_matching.match_areas
+    required, search = [], global_scan_matching.find_cells
 
-    def record_search(query, candidate, prior, settings, *constraints):
+    def record_search(query, candidate, points, prior, settings, *constraints):
         required.append(settings.min_log_ratio)
-        return search(query, candidate, prior, settings, *constraints)
+        return search(query, candidate, points, prior, settings, *constraints)
 
-    monkeypatch.setattr(global_scan_matching, "match_areas", record_search)
+    monkeypatch.setattr(global_scan_matching, "find_cells", record_search)
     best_share = max(fit.agreement.matched_share for fit in match([0, 1]) if fit.area == 0)
     assert best_share > 0.9
     assert required == pytest.approx([0.5 * np.log(3.0), (best_share - 0.15) * np.log(3.0)])

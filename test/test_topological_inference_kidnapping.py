@@ -22,11 +22,8 @@ from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 from hmt_slam_ros.topological_inference.global_localization import UNMAPPED_PRIOR, PoseDistribution
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
 from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, HypothesisState, Lost, PoseInArea, Tracking
-from hmt_slam_ros.topological_inference.relocalization import (
-    KIDNAPPED_UNMAPPED_PRIOR,
-    decide_without_mapping,
-    spawn_kidnapped_hypothesis,
-)
+from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
+from hmt_slam_ros.topological_inference.relocalization import KIDNAPPED_UNMAPPED_PRIOR
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 FAR, HERE = (30.0, 20.0), (0.0, 0.0)
@@ -112,13 +109,13 @@ def test_without_mapping_it_moves_to_the_area_of_its_relocalization(mapping, are
 
 
 def test_it_is_searched_in_the_map_from_before_the_kidnapping(monkeypatch):
-    searches, search = [], ClosureSearch.localize_globally
+    searches, begin = [], ClosureSearch.begin_global_search
 
     def record_search(closure_search, hybrid_map, poses, before, *others):
         searches.append((before, sorted(poses)))
-        return search(closure_search, hybrid_map, poses, before, *others)
+        return begin(closure_search, hybrid_map, poses, before, *others)
 
-    monkeypatch.setattr(ClosureSearch, "localize_globally", record_search)
+    monkeypatch.setattr(ClosureSearch, "begin_global_search", record_search)
     spawn((ROOM, OTHER, ROOM), {2: 8.0})
     assert searches == [(14, [14, 15, 16, 17])]
 

@@ -15,9 +15,9 @@ from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
 from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
-from hmt_slam_ros.topological_inference import relocalization
+from hmt_slam_ros.topological_inference import kidnapping, relocalization
 from hmt_slam_ros.topological_inference.branching import Branches, Parent
-from hmt_slam_ros.topological_inference.global_localization import PoseDistribution, PoseHint
+from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseDistribution, PoseHint
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     FalseAlarm,
@@ -140,10 +140,28 @@ def test_a_search_determines_the_pose_where_it_is_probable_certain_and_matches(
 
 
 class GivenSearch(SimpleNamespace):
-    """Branching whose search finds a distribution that is given."""
+    """Branching whose search finds a distribution that is given, after some events."""
 
-    def localize_globally(self, _parent, poses, before, hint=None):
-        self.requested = poses, before, hint
+    def __init__(self, events=1, **given):
+        super().__init__(first_areas=[], remaining=events, **given)
+        self.search = SimpleNamespace(
+            begin_global_search=self.begin,
+            continue_global_search=self.go_on,
+            is_conclusive=lambda _map, _search, _clutter, _hint=None: self.remaining == 0,
+        )
+
+    def begin(self, _hybrid_map, poses, before, hint=None, only=()):
+        self.requested, self.only = (poses, before, hint), only
+        return GlobalSearch(poses, before, 3, {}, self.found.candidates, frozenset({1, 2}))
+
+    def go_on(self, _hybrid_map, search, first=None):
+        self.first_areas.append(first)
+        self.remaining -= 1
+        return search
+
+    def localize_globally(self, _parent, search, hint=None):
+        assert search.poses is self.requested[0]
+        assert (hint is None) is (self.requested[2] is None)
         return self.found
 
 
@@ -172,6 +190,71 @@ def test_a_lost_robot_is_searched_by_its_keyframes_seen_from_the_first():
     assert child.state.localization.candidate is None
     other, _, _ = search(Lost(21, pose_hint=replace(hint, keyframe=9)))
     assert other.requested[2] is None
+
+
+def test_a_search_goes_on_with_its_keyframes_until_it_is_over():
+    """Those that came meanwhile wait for the next search, which begins after three of them."""
+    pair = (candidate(1, [2.0, 1.0, 0.4]), 0.9)
+    branching, parent = GivenSearch(3, options=OPTIONS, found=distribution(pair)), make_parent(Lost(21))
+    for _ in range(2):
+        (child,) = relocalization.update_relocalization(branching, parent).children
+        parent = replace(parent, state=child.state)
+        assert relocalization.is_searching(parent)
+        assert list(child.state.localization.search.poses) == [21, 22, 23, 24, 25]
+        own = parent.hybrid_map.keyframes(5)
+        parent.hybrid_map.set_keyframe(max(own) + 1, 5, se2.compose(own[max(own)], [0.5, 0.0, 0.1]))
+        assert not relocalization.is_search_due(parent, OPTIONS)
+    (child,) = relocalization.update_relocalization(branching, parent).children
+    parent = replace(parent, state=child.state)
+    lost = parent.state.localization
+    assert (lost.search, lost.searched, lost.candidate.keyframe) == (None, 25, 25)
+    assert branching.first_areas == [None] * 3
+    assert not relocalization.is_searching(parent)
+    due = []
+    for keyframe in range(28, 31):
+        due.append(relocalization.is_search_due(parent, OPTIONS))
+        parent.hybrid_map.set_keyframe(keyframe, 5, np.zeros(3))
+    assert due == [False, False, False]
+    assert relocalization.is_search_due(parent, OPTIONS)
+    assert not relocalization.is_search_due(make_parent(Tracking()), OPTIONS)
+    branching.remaining = 1
+    relocalization.update_relocalization(branching, parent)
+    assert branching.first_areas[3:] == [1]
+    assert branching.only == {1, 2}
+
+
+def test_a_search_whose_keyframes_left_the_submap_is_given_up():
+    branching, parent = GivenSearch(options=OPTIONS, found=distribution()), make_parent(Lost(21))
+    search = branching.begin({}, {3: np.zeros(3), 4: np.ones(3)}, 2)
+    parent = make_parent(Lost(21, search=search))
+    (child,) = relocalization.update_relocalization(branching, parent).children
+    assert (child.state.localization.search, child.state.localization.searched) == (None, 4)
+
+
+def test_the_reference_of_a_search_lies_where_its_newest_keyframe_is_now():
+    """The area has changed since, and the older keyframes are in none of the submap."""
+    pose, hint = np.array([2.0, 1.0, 0.4]), PoseHint(25, 1, PoseGaussian(np.array([4.0, 2.0, 0.5]), SHARP))
+    branching = GivenSearch(options=OPTIONS, found=distribution((candidate(1, pose), 0.95)))
+    parent = make_parent(Lost(21, pose_hint=hint))
+    poses = {3: np.zeros(3), 24: np.array([1.0, 0.2, 0.1]), 25: np.array([1.5, 0.3, 0.2])}
+    search = branching.begin({}, poses, 2, hint)
+    parent = make_parent(Lost(21, pose_hint=hint, search=search))
+    _, relocalized = relocalization.update_relocalization(branching, parent).children
+    reference = se2.compose(parent.hybrid_map.keyframes(5)[25], se2.inverse(poses[25]))
+    np.testing.assert_allclose(relocalized.arcs[0].pose.mean, se2.compose(reference, se2.inverse(pose)))
+
+
+@pytest.mark.parametrize(("probability", "is_unknown"), [(0.09, True), (0.11, False)])
+def test_keyframes_on_unmapped_ground_are_not_searched_again(probability, is_unknown):
+    pair = (candidate(1, [2.0, 1.0, 0.4]), probability)
+    (child,) = search(Lost(21), pair)[2].children
+    assert child.state.localization.unknown == (25 if is_unknown else -1)
+    alarm = FalseAlarm(PoseInArea(1, 40, np.array([3.0, 2.0, 0.5])), 0.7)
+    (child,) = search(Lost(21, false_alarm=alarm), pair)[2].children
+    assert child.state.localization.unknown == -1
+    branching, _, _ = search(Lost(21, unknown=22), pair)
+    assert list(branching.requested[0]) == [23, 24, 25]
+    assert branching.requested[1] == 21
 
 
 @pytest.mark.parametrize(
@@ -278,8 +361,8 @@ def test_the_newest_forty_keyframes_of_the_submap_are_searched():
 
 @pytest.mark.parametrize(("event", "expected"), [(22, [22, 23, 24, 25]), (20, [21, 22, 23, 24, 25]), (26, [])])
 def test_an_area_keeps_a_keyframe_when_others_begin_a_new_one(event, expected):
-    assert relocalization._keyframes_since(make_parent(Tracking()), event) == expected
-    kept = relocalization._keyframes_since(make_parent(Tracking()), 21)
+    assert kidnapping._keyframes_since(make_parent(Tracking()), event) == expected
+    kept = kidnapping._keyframes_since(make_parent(Tracking()), 21)
     assert kept == [21, 22, 23, 24, 25]
 
 
@@ -339,8 +422,8 @@ def test_without_mapping_a_probable_kidnapping_that_no_match_refutes_loses_the_r
     evidence = {29: 1.0, 30: log_odds - math.log(prior) - 1.0}
     parent = make_parent(Tracking())
     state = replace(parent.state, kidnapping_evidence=evidence, unstored_poses={30: pose})
-    monkeypatch.setattr(relocalization, "_confirms_tracked_pose", lambda _branching, _parent, _since: confirmed)
-    child = relocalization.decide_without_mapping(SimpleNamespace(options=OPTIONS), replace(parent, state=state), 30)
+    monkeypatch.setattr(kidnapping, "_confirms_tracked_pose", lambda _branching, _parent, _since: confirmed)
+    child = kidnapping.decide_without_mapping(SimpleNamespace(options=OPTIONS), replace(parent, state=state), 30)
     assert child.state.is_lost is lost
     if log_odds > 0.0:
         assert child.state.kidnapping_evidence == child.state.unstored_poses == {}
@@ -365,10 +448,10 @@ def test_scans_that_no_map_holds_are_matched_seen_from_the_first_since_then():
     parent = replace(parent, state=replace(parent.state, unstored_poses=poses))
     first = se2.compose(ARC, poses[29].pose)
     branching = GivenSearch(options=OPTIONS, found=distribution((candidate(0, first, 0.7), 0.5)))
-    assert relocalization._confirms_tracked_pose(branching, parent, 29)
+    assert kidnapping._confirms_tracked_pose(branching, parent, 29)
     requested, before, _ = branching.requested
     assert (list(requested), before) == ([29, 31], 29)
     np.testing.assert_allclose(requested[31], se2.between(first, poses[31].pose))
     branching.found = distribution((candidate(0, first, 0.5), 0.5))
-    assert not relocalization._confirms_tracked_pose(branching, parent, 29)
-    assert not relocalization._confirms_tracked_pose(branching, parent, 99)
+    assert not kidnapping._confirms_tracked_pose(branching, parent, 29)
+    assert not kidnapping._confirms_tracked_pose(branching, parent, 99)

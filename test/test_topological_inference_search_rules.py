@@ -1,5 +1,6 @@
 """Rules of the search in the whole map and of TSBI around it, with matches that are given."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,9 @@ from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.messages import TrackingReset
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.registration.area_to_area import MatchMode, MatchSettings
+from hmt_slam_ros.registration.branch_and_bound import SearchCells
 from hmt_slam_ros.registration.consistency import Agreement
+from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 from hmt_slam_ros.topological_inference import global_scan_matching as module
 from hmt_slam_ros.topological_inference.branching import Branching, Parent
 from hmt_slam_ros.topological_inference.global_localization import UNMAPPED_PRIOR
@@ -69,30 +72,51 @@ def test_matches_count_in_the_areas_that_are_searched_alone(monkeypatch):
         )
         for x in (2.0, 3.0, -1.0, 2.5)
     ]
-    requested = []
-    monkeypatch.setattr(module, "match_areas", lambda *given: requested.append(given) or SimpleNamespace(modes=modes))
+    searched, matched = [], []
+    cells = SearchCells(np.zeros((1, 3), np.int64), np.ones(1), np.zeros(1), 7)
+    monkeypatch.setattr(module, "find_cells", lambda *given: searched.append(given) or cells)
+    monkeypatch.setattr(
+        module, "match_areas", lambda *given: matched.append(given) or SimpleNamespace(modes=modes, work=0)
+    )
     places = {2.0: 2, 3.0: 3, -1.0: None, 2.5: 2}
     monkeypatch.setattr(module, "containing_area", lambda _place, poses, _radius: places[float(poses[0, 0])])
     grid = module.AreaGrid(
         np.zeros(2), 0.1, np.zeros((9, 9)), np.zeros((18, 18), np.float32), np.zeros((9, 9), bool), rng.random((70, 2))
     )
-    place = SimpleNamespace(
-        grid=grid, positions=np.array([[0.0, 0.0], [5.0, 1.0], [9.0, 3.0]]), keyframe_areas=np.array([2, 3, 2])
-    )
-    matcher = GlobalScanMatcher(None, None, MatchSettings(temper=0.1, margin=2.0), 1.5, 6.0)
-    found = list(matcher._match_region(place, grid, {7: np.zeros(3)}, {2}, 0.8))
+    surface = LogRatioGrid(grid.log_ratio, grid.origin, grid.cell)
+    cache = SimpleNamespace(coarse_grid=lambda _known: surface, grid=lambda _known: grid)
+    known = {1: np.array([0.0, 0.0, 0.3]), 2: np.array([5.0, 1.0, 0.2]), 3: np.array([9.0, 3.0, 0.1])}
+    positions = np.array([[0.0, 0.0], [5.0, 1.0], [9.0, 3.0]])
+    matcher = GlobalScanMatcher(cache, None, MatchSettings(temper=0.1, margin=2.0), 1.5, 6.0)
+    search = (known, np.array([2, 3, 2]), grid, {7: np.zeros(3)}, {2}, 0.8)
+    found, work = matcher._match_keyframes(*search)
+    # A cell of the map counts as twenty samples.
+    assert work == 7 + 20 * 81
     assert [(each.area, each.mode) for each in found] == [(2, modes[0]), (2, modes[3])]
-    sparse_query, sparse_map, prior, settings, bounds, constraint = requested[0]
+    sparse_query, given_surface, back, prior, settings, bounds, constraint = searched[0]
+    assert matched[0][1] is grid
+    assert matched[0][5] is cells
+    assert given_surface is surface
+    assert back.shape == (0, 2)
     np.testing.assert_array_equal(sparse_query.points, grid.points[::3])
-    np.testing.assert_array_equal(sparse_map.points, grid.points[::3])
     assert settings.temper == pytest.approx(0.3)
     assert settings.margin == pytest.approx(max(2.0, 0.15 * np.log(3.0) * 0.3 * 24))
     assert (settings.min_log_ratio, settings.max_modes, settings.check_reverse) == (0.8, 40, False)
     np.testing.assert_allclose(np.sqrt(np.diag(prior.covariance)), [100.0, 100.0, 20.0])
     # Keyframes of area 3 bound nothing.
-    np.testing.assert_allclose(bounds, query_bounds(place.positions[[0, 2]], grid, {7: np.zeros(3)}, 1.5))
-    expected = module.constrain_around(place.positions[[0, 2]], np.zeros((1, 2)), 1.5, 0.1)
+    np.testing.assert_allclose(bounds, query_bounds(positions[[0, 2]], grid, {7: np.zeros(3)}, 1.5))
+    is_searched = np.array([True, False, True])
+    expected = module.constrain_around(positions, is_searched, np.zeros((1, 2)), 1.5, 0.1)
     np.testing.assert_array_equal(constraint.allowed.log_ratio, expected.allowed.log_ratio)
+    # Of many samples 160 are matched at most.
+    many = replace(grid, points=rng.random((1000, 2)))
+    matcher._match_keyframes(*search[:2], many, *search[3:])
+    np.testing.assert_array_equal(searched[1][0].points, many.points[::7])
+    assert searched[1][4].temper == pytest.approx(0.7)
+    # Where nothing fits, no map is built.
+    cache.grid = None
+    monkeypatch.setattr(module, "find_cells", lambda *_: SearchCells(np.zeros((0, 3), np.int64), *np.zeros((2, 0)), 9))
+    assert matcher._match_keyframes(*search) == ([], 9 + 20 * 81)
 
 
 @pytest.mark.parametrize("lost", [(), (1,), (0, 1)])
@@ -107,7 +131,8 @@ def test_between_searches_the_heaviest_map_and_the_places_of_lost_hypotheses_are
     branching.look_ahead(parents)
     branching.landmarks = SimpleNamespace(prepare_places=prepared.append)
     branching.look_ahead(parents)
-    assert [each is maps[1] for each in looked] == [True, True]
+    # Their own search is work enough.
+    assert [each is maps[1] for each in looked] == ([] if lost else [True, True])
     assert len(prepared) == bool(lost)
     for given in prepared:
         assert [(each is maps[n], since) for (each, since), n in zip(given, lost, strict=True)] == [

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -20,10 +21,12 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid
+from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.polar_scan import FREE, classify_points, to_polar_scan
 
 Pose = Float64
+Grid = TypeVar("Grid")
 
 _ORIGIN = np.zeros(3)
 """Pose of a frame in itself."""
@@ -43,8 +46,8 @@ _MAX_NEIGHBORS = 64
 _CACHE_BYTES = 4 << 23
 """Size of the grids that are cached, bytes: those of about ten places of a large building."""
 
-WHOLE_MAP_CACHE_BYTES = 4 * _CACHE_BYTES
-"""The same during global localization, which searches the whole map again and again, bytes."""
+_COARSE_CACHE_BYTES = 3 * _CACHE_BYTES
+"""Size of the coarse grids that global localization needs again and again, bytes: those of about forty regions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +204,31 @@ def consistent_pose(
     return pose if agrees else belief.mean
 
 
+class _RecentGrids(Generic[Grid]):
+    """Grids of keyframes at poses, of which the least recently used are evicted.
+
+    :param max_bytes: their size, bytes; the newest one is kept in any case.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self._grids: OrderedDict[bytes, tuple[Grid, int]] = OrderedDict()
+
+    def clear(self) -> None:
+        self._grids.clear()
+
+    def get(self, keyframes: Mapping[int, Pose], build: Callable[[Mapping[int, Pose]], tuple[Grid, int]]) -> Grid:
+        """The grid of the keyframes; ``build`` makes it, and says its size, bytes."""
+        key = np.array(list(keyframes), dtype=np.int64).tobytes() + stack_poses(keyframes).tobytes()
+        if key not in self._grids:
+            self._grids[key] = build(keyframes)
+            size = sum(own for _, own in self._grids.values())
+            while size > self._max_bytes and len(self._grids) > 1:
+                size -= self._grids.popitem(last=False)[1][1]
+        self._grids.move_to_end(key)
+        return self._grids[key][0]
+
+
 class GridCache:
     """Grids and places, built from the keyframes' scans. The least recently used grids are evicted."""
 
@@ -212,30 +240,31 @@ class GridCache:
         :param max_bytes: size of the cached grids, bytes.
         """
         self._scans = scans
-        self._max_bytes = max_bytes
         self._model = model
         self._neighborhood = neighborhood
-        self._grids: OrderedDict[bytes, AreaGrid] = OrderedDict()
+        self._grids = _RecentGrids[AreaGrid](max_bytes)
+        self._coarse_grids = _RecentGrids[LogRatioGrid](_COARSE_CACHE_BYTES)
 
     def clear(self) -> None:
         """Drop all grids."""
         self._grids.clear()
+        self._coarse_grids.clear()
 
     def grid(self, keyframes: Mapping[int, Pose]) -> AreaGrid:
         """What the keyframes saw, placed at the given poses."""
-        poses = stack_poses(keyframes)
-        key = np.array(list(keyframes), dtype=np.int64).tobytes() + poses.tobytes()
-        if key not in self._grids:
-            self._grids[key] = build_area_grid([self._scans[k] for k in keyframes], poses, self._model)
-            self._evict_oldest()
-        self._grids.move_to_end(key)
-        return self._grids[key]
+        return self._grids.get(keyframes, self._build)
 
-    def _evict_oldest(self) -> None:
-        """Drop the least recently used grids down to the size limit, but keep the newest one."""
-        size = sum(grid.nbytes for grid in self._grids.values())
-        while size > self._max_bytes and len(self._grids) > 1:
-            size -= self._grids.popitem(last=False)[1].nbytes
+    def _build(self, keyframes: Mapping[int, Pose]) -> tuple[AreaGrid, int]:
+        grid = build_area_grid([self._scans[k] for k in keyframes], stack_poses(keyframes), self._model)
+        return grid, grid.nbytes
+
+    def coarse_grid(self, keyframes: Mapping[int, Pose]) -> LogRatioGrid:
+        """The log-ratios of :meth:`grid`, which take a sixth of its memory and outlast it."""
+        return self._coarse_grids.get(keyframes, self._build_coarse)
+
+    def _build_coarse(self, keyframes: Mapping[int, Pose]) -> tuple[LogRatioGrid, int]:
+        grid = self.grid(keyframes)
+        return LogRatioGrid(grid.log_ratio, grid.origin, grid.cell), grid.log_ratio.nbytes
 
     def static_points(self, keyframes: Mapping[int, Pose]) -> Float64:
         """Surface points of the keyframes that none of them sees through, shape (n, 2), m."""
@@ -248,7 +277,7 @@ class GridCache:
 
     def grid_before(self, hybrid_map: HybridMap, poses: Mapping[int, Pose], keyframe: int) -> AreaGrid:
         """What the keyframes before a given one saw, of areas at ``poses``, {area: pose}."""
-        return self.grid(_keyframes_before(hybrid_map, poses, keyframe)[0])
+        return self.grid(keyframes_before(hybrid_map, poses, keyframe)[0])
 
     def place(
         self,
@@ -272,16 +301,16 @@ class GridCache:
         self, hybrid_map: HybridMap, area: int, poses: Mapping[int, Pose], before: float = math.inf
     ) -> AreaPlace:
         """The place of ``area`` among areas at ``poses``, {other area: ``area_T_other``}."""
-        keyframes, areas = _keyframes_before(hybrid_map, poses, before)
+        keyframes, areas = keyframes_before(hybrid_map, poses, before)
         return AreaPlace(area, np.array(areas, dtype=np.int64), stack_poses(keyframes)[:, :2], self.grid(keyframes))
 
 
-def _keyframes_before(
+def keyframes_before(
     hybrid_map: HybridMap, poses: Mapping[int, Pose], before: float
 ) -> tuple[dict[int, Pose], list[int]]:
     """Keyframes before a given one in the common frame of their areas, {keyframe: pose}, and the area of each.
 
-    :param poses: {area: pose of its frame}.
+    :param poses: {area: pose of its frame}, m and rad.
     """
     keyframes: dict[int, Pose] = {}
     areas: list[int] = []

@@ -95,9 +95,11 @@ class AreaMatch:
 
     :ivar log_evidence: log of the integral of p(x) (p(z | x, candidate) / p(z | unknown))^temper over the gate, nats;
         -inf where all of it is negligible.
+    :ivar work: number of samples that the search looked up.
     """
 
     log_evidence: float = -math.inf
+    work: int = 0
     _find_modes: Callable[[], tuple[MatchMode, ...]] = tuple
 
     # On demand: for some comparisons the evidence is enough.
@@ -113,7 +115,7 @@ def match_areas(
     prior: PoseGaussian,
     settings: MatchSettings,
     bounds: Float64 | None = None,
-    constraint: PositionConstraint | None = None,
+    cells: SearchCells | None = None,
 ) -> AreaMatch:
     """All poses of the query in the candidate that the prior admits.
 
@@ -122,12 +124,47 @@ def match_areas(
     :param prior: belief over ``candidate_T_query``.
     :param bounds: shape (2, 2), the smallest and the largest (x, y) in the candidate for the middle of the query's
         points, m.
+    :param cells: those of :func:`find_cells` with the same arguments, if they are known.
+    """
+    result, work = _search(query, candidate, prior, settings, bounds, cells)
+    if result is None:
+        return AreaMatch(work=work)
+    return AreaMatch(float(np.logaddexp.reduce(result.masses)), work, lambda: tuple(_modes(result)))
+
+
+def find_cells(
+    query: AreaGrid,
+    candidate: LogRatioGrid,
+    candidate_points: Float64,
+    prior: PoseGaussian,
+    settings: MatchSettings,
+    bounds: Float64 | None = None,
+    constraint: PositionConstraint | None = None,
+) -> SearchCells:
+    """The cells of the lattice of poses that matter; :func:`match_areas` makes modes of them.
+
+    The other arguments are those of :func:`match_areas`.
+
+    :param candidate: log-ratios of the candidate's map.
+    :param candidate_points: its surface points, shape (n, 2), m, for the reverse check.
     :param constraint: limits on the positions of the query's keyframes, if any.
     """
-    result = _search(query, candidate, prior, settings, bounds, constraint)
-    if result is None:
-        return AreaMatch()
-    return AreaMatch(float(np.logaddexp.reduce(result.masses)), lambda: tuple(_modes(result)))
+    centered = _center(query, candidate.cell, prior, settings, bounds)
+    back_points = candidate_points[: None if settings.check_reverse else 0]
+    if constraint is not None:
+        constraint = constraint._replace(keyframes=constraint.keyframes - centered.to_middle.mean[:2])
+    least_ratio = settings.temper * settings.min_log_ratio * len(query.points)
+    return search_cells(
+        centered.window,
+        candidate,
+        centered.query.points,
+        _coarse_grid(centered.query),
+        _reachable_points(back_points, centered.window, centered.query),
+        settings.temper,
+        max(math.log(_NEGLIGIBLE_SHARE) - min(0.0, centered.log_cell), least_ratio),
+        settings.margin,
+        constraint,
+    )
 
 
 def best_pose(
@@ -137,7 +174,7 @@ def best_pose(
 
     It costs a fraction of the mode with its covariance.
     """
-    result = _search(query, candidate, prior, settings)
+    result, _ = _search(query, candidate, prior, settings)
     if result is None:
         return None
     labels, totals = _cluster(result)
@@ -152,38 +189,48 @@ def _search(
     prior: PoseGaussian,
     settings: MatchSettings,
     bounds: Float64 | None = None,
-    constraint: PositionConstraint | None = None,
-) -> _SearchResult | None:
+    cells: SearchCells | None = None,
+) -> tuple[_SearchResult | None, int]:
+    """The cells of a search, None without any, and the number of samples that it looked up."""
     if not query.points.size or not candidate.points.size:
-        return None
+        return None, 0
+    if cells is None:
+        cells = find_cells(query, _coarse_grid(candidate), candidate.points, prior, settings, bounds)
+    if not cells.score.size:
+        return None, cells.work
+    centered, surface = _center(query, candidate.cell, prior, settings, bounds), _fine_grid(candidate)
+    samples, window = centered.query.points, centered.window
+    problem = _MatchProblem(surface, samples, window, centered.prior, settings, centered.to_middle)
+    masses, poses = match_modes.integrate_cells(surface, samples, window, cells, settings.temper)
+    return _SearchResult(problem, cells, masses + centered.log_cell, poses), cells.work
+
+
+def _center(
+    query: AreaGrid, cell: float, prior: PoseGaussian, settings: MatchSettings, bounds: Float64 | None
+) -> _CenteredQuery:
+    """The search of a query, not empty, in a grid with cells of an edge, m."""
     # In the middle of the samples turns and shifts are least correlated, and the lattice of turns is coarsest.
     middle = query.points.mean(axis=0)
     to_middle = PoseGaussian.from_pose(np.array([*middle, 0.0]))
-    centered = query.shift_origin(middle)
-    prior = prior.compose(to_middle)
-    turn = _turn_step(candidate.cell, centered.points)
-    window = make_search_window(prior.mean, prior.covariance, candidate.cell, turn, settings.gate, bounds)
-    surface, log_cell = _fine_grid(candidate), _log_cell_mass(prior, candidate.cell, turn)
-    back_points = _reachable_points(candidate.points[: None if settings.check_reverse else 0], window, centered)
-    threshold = max(
-        math.log(_NEGLIGIBLE_SHARE) - min(0.0, log_cell), settings.temper * settings.min_log_ratio * len(query.points)
-    )
-    cells = search_cells(
-        window,
-        _coarse_grid(candidate),
-        centered.points,
-        _coarse_grid(centered),
-        back_points,
-        settings.temper,
-        threshold,
-        settings.margin,
-        None if constraint is None else constraint._replace(keyframes=constraint.keyframes - middle),
-    )
-    if not cells.score.size:
-        return None
-    problem = _MatchProblem(surface, centered.points, window, prior, settings, to_middle)
-    masses, poses = match_modes.integrate_cells(surface, centered.points, window, cells, settings.temper)
-    return _SearchResult(problem, cells, masses + log_cell, poses)
+    centered, prior = query.shift_origin(middle), prior.compose(to_middle)
+    turn = _turn_step(cell, centered.points)
+    window = make_search_window(prior.mean, prior.covariance, cell, turn, settings.gate, bounds)
+    return _CenteredQuery(centered, window, prior, to_middle, _log_cell_mass(prior, cell, turn))
+
+
+class _CenteredQuery(NamedTuple):
+    """A query in the frame of the middle of its samples.
+
+    :ivar prior: over ``candidate_T_middle``.
+    :ivar to_middle: ``query_T_middle``.
+    :ivar log_cell: log of the prior's mass in a cell of the lattice at its mean.
+    """
+
+    query: AreaGrid
+    window: SearchWindow
+    prior: PoseGaussian
+    to_middle: PoseGaussian
+    log_cell: float
 
 
 @dataclass(frozen=True, eq=False)

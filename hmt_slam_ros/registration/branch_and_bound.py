@@ -18,6 +18,7 @@ from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.se2 import rotate_back
 from hmt_slam_ros.registration.search_bounds import (
     BLOCK,
+    TOP_STEPS,
     LogRatioGrid,
     Pyramid,
     SearchWindow,
@@ -29,11 +30,17 @@ from hmt_slam_ros.registration.search_bounds import (
     square_bound,
 )
 
+_OWN, _AROUND = 1.0, 0.5
+"""Values of cells near a position that is searched, and near one around those."""
+
+_AROUND_STEPS = round(_AROUND / _OWN * TOP_STEPS)
+"""The latter in a pyramid, steps."""
+
 
 class PositionConstraint(NamedTuple):
-    """Cells in which at least one keyframe of the query has to be.
+    """Cells in which half of the query's keyframes have to be, one of them in a cell near a searched position.
 
-    :ivar allowed: above 0 in these cells, candidate frame.
+    :ivar allowed: candidate frame, 1 near a searched position, 0.5 near one around those, 0 elsewhere.
     :ivar keyframes: shape (m, 2), positions of the keyframes, m, query frame; none without a constraint.
     """
 
@@ -52,9 +59,12 @@ class ConstraintPyramid(NamedTuple):
     keyframes: Int32
 
 
-def constrain_around(known: Float64, keyframes: Float64, radius: float, cell: float) -> PositionConstraint:
+def constrain_around(
+    known: Float64, is_searched: Bool, keyframes: Float64, radius: float, cell: float
+) -> PositionConstraint:
     """The constraint to within ``radius``, m, of the positions ``known``, shape (n, 2), m.
 
+    :param is_searched: shape (n,), which of them are searched; the others lie around those.
     :param keyframes: shape (m, 2), m, query frame.
     :param cell: edge of a cell, m.
     """
@@ -63,7 +73,8 @@ def constrain_around(known: Float64, keyframes: Float64, radius: float, cell: fl
     origin = np.floor((known.min(axis=0) - reach) / cell) * cell
     columns, rows = np.ceil((known.max(axis=0) + reach - origin) / cell).astype(np.int64) + 1
     cells = np.zeros((rows, columns), np.float32)
-    _mark_disks(cells, (known - origin) / cell - 0.5, reach / cell)
+    for positions, value in ((known, _AROUND), (known[is_searched], _OWN)):
+        _mark_disks(cells, (positions - origin) / cell - 0.5, reach / cell, value)
     return PositionConstraint(LogRatioGrid(cells, origin, cell), keyframes)
 
 
@@ -79,26 +90,30 @@ def build_constraint_pyramid(constraint: PositionConstraint, window: SearchWindo
 
 
 @njit(cache=True)
-def _mark_disks(cells: Float32, known: Float64, reach: float) -> None:
-    """Mark the cells within ``reach`` cells of the positions ``known``, shape (n, 2), cells."""
+def _mark_disks(cells: Float32, known: Float64, reach: float, value: float) -> None:
+    """Write ``value`` to the cells within ``reach`` cells of the positions ``known``, shape (n, 2), cells."""
     rows, columns = cells.shape
     for n in range(known.shape[0]):
         x, y = known[n, 0], known[n, 1]
         for r in range(max(0, int(np.ceil(y - reach))), min(rows, int(np.floor(y + reach)) + 1)):
             half = np.sqrt(max(0.0, reach * reach - (r - y) ** 2))
-            cells[r, max(0, int(np.ceil(x - half))) : min(columns, int(np.floor(x + half)) + 1)] = np.float32(1.0)
+            cells[r, max(0, int(np.ceil(x - half))) : min(columns, int(np.floor(x + half)) + 1)] = np.float32(value)
 
 
 @njit(cache=True)
 def is_admissible(constraint: ConstraintPyramid, height: int, k: int, i: int, j: int) -> bool:
-    """Whether a keyframe meets the constraint at turn ``k`` in the square of shifts that begins at (i, j)."""
+    """Whether the constraint can be met at turn ``k`` in the square of shifts that begins at (i, j)."""
     level, margin, cells = constraint.pyramid.levels[height], constraint.pyramid.margin, constraint.keyframes[k]
     rows, columns = np.uint32(level.shape[0]), np.uint32(level.shape[1])
-    for n in range(cells.shape[0]):
+    count, outside, largest = cells.shape[0], 0, 0
+    for n in range(count):
         x, y = np.uint32(cells[n, 0] + i + margin), np.uint32(cells[n, 1] + j + margin)
-        if x < columns and y < rows and level[y, x] > 0:
-            return True
-    return cells.shape[0] == 0
+        value = level[y, x] if x < columns and y < rows else 0
+        largest = max(largest, value)
+        outside += value == 0
+        if 2 * outside > count:
+            return False
+    return count == 0 or largest > _AROUND_STEPS
 
 
 class ReverseCheck(NamedTuple):
@@ -204,11 +219,13 @@ class SearchCells(NamedTuple):
     :ivar indices: shape (n, 3), int64, (k, i, j).
     :ivar score: shape (n,), nats: tempered log-ratio plus the prior's exponent.
     :ivar contradiction: shape (n,), nats, at most 0: the part of the score from the reverse check.
+    :ivar work: number of samples that were looked up.
     """
 
     indices: Int64
     score: Float64
     contradiction: Float64
+    work: int = 0
 
 
 class _SearchProblem(NamedTuple):
@@ -262,19 +279,23 @@ def search_cells(
         temper,
         margin,
     )
-    cells = _search_depth_first(task, height, threshold)
+    cells, squares = _search_depth_first(task, height, threshold)
     cells = cells[cells[:, 3] >= max(threshold, cells[:, 3].max(initial=-np.inf) - margin)]
-    return SearchCells(cells[:, :3].astype(np.int64), cells[:, 3].copy(), cells[:, 4].copy())
+    work = squares * len(samples)
+    return SearchCells(cells[:, :3].astype(np.int64), cells[:, 3].copy(), cells[:, 4].copy(), work)
 
 
 @njit(cache=True)
-def _search_depth_first(task: _SearchProblem, height: int, threshold: float) -> Float64:
-    """Cells (k, i, j, score, contradiction), a superset of the result; depth first, best bound first."""
+def _search_depth_first(task: _SearchProblem, height: int, threshold: float) -> tuple[Float64, int]:
+    """Cells (k, i, j, score, contradiction), a superset of the result, and the number of squares with a bound.
+
+    Depth first, best bound first.
+    """
     nodes, coarse = _coarse_nodes(task, height)
     stack, bounds = np.empty((4 * height + 8, 4), dtype=np.int64), np.empty(4 * height + 8)
     found, count = np.empty((1024, 5)), 0
     points = np.empty_like(task.reverse.points)
-    least = threshold
+    least, squares = threshold, len(nodes)
     for n in np.argsort(-coarse, kind="mergesort"):
         stack[0, :3], stack[0, 3], bounds[0] = nodes[n], height, coarse[n]
         size = 1
@@ -283,13 +304,14 @@ def _search_depth_first(task: _SearchProblem, height: int, threshold: float) -> 
             if bounds[size] < least:
                 continue
             k, i, j, h = stack[size, 0], stack[size, 1], stack[size, 2], stack[size, 3]
+            squares += BLOCK
             if 2**h > BLOCK:
                 size = _push_quarters(task, stack, bounds, size, (k, i, j), h - 1, least)
                 continue
             if count + BLOCK * BLOCK > len(found):
                 found = np.concatenate((found, np.empty_like(found)))
             count, least = _take_cells(task, (k, i, j), points, found, count, least)
-    return found[:count]
+    return found[:count], squares
 
 
 @njit(cache=True)
@@ -303,8 +325,10 @@ def _coarse_nodes(task: _SearchProblem, height: int) -> tuple[Int64, Float64]:
     for k in range(window.turns.size):
         for i in range(window.first[0], window.last[0] + 1, side):
             for j in range(window.first[1], window.last[1] + 1, side):
+                if not is_admissible(task.constraint, height, k, i, j):
+                    continue
                 prior = prior_bound(window, k, i, j, side)
-                if prior > -np.inf and is_admissible(task.constraint, height, k, i, j):
+                if prior > -np.inf:
                     steps = square_bound(task.bounds.levels[height], task.bounds.margin, task.cells[k], i, j)
                     nodes[n, 0], nodes[n, 1], nodes[n, 2] = k, i, j
                     bounds[n] = task.temper * task.bounds.step * steps + prior

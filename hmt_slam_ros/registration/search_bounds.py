@@ -98,7 +98,7 @@ def prior_bound(window: SearchWindow, k: int, i: int, j: int, side: int) -> floa
 BLOCK = 4
 """Edge of a block of cells, a power of 2."""
 
-_TOP = 64
+TOP_STEPS = 64
 """The largest log-ratio in steps; log-ratios below -128 steps are rounded up to that."""
 
 
@@ -127,7 +127,7 @@ class Pyramid(NamedTuple):
 def build_pyramid(log_ratio: Float32, height: int) -> Pyramid:
     """The pyramid of a grid, with levels 0 to ``height``."""
     margin = 2**height
-    step = max(float(log_ratio.max()), 1e-6) / _TOP
+    step = max(float(log_ratio.max()), 1e-6) / TOP_STEPS
     rows, columns = log_ratio.shape
     levels = np.zeros((height + 1, rows + 2 * margin, columns + 2 * margin), dtype=np.int8)
     _round_up(log_ratio, 1.0 / step, levels[0, margin:, margin:])

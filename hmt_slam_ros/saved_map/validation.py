@@ -239,6 +239,8 @@ def _check_hypothesis_state(one: Any, state: Any, own: HypothesisMap, path: str)
         require_areas(own, [pose.area for pose in known if pose is not None], f"{path}.localization")
         before = [keyframe for keyframe in one.unmatched_keyframes if keyframe < lost.since]
         require(not before, f"{path}.localization.since", lost.since, "that of the keyframes without a match")
+        if lost.search is not None:
+            require(bool(lost.search.poses), f"{path}.localization.search.poses", "empty", "one keyframe at least")
     elif one.localization.relocalized_area is not None:
         require_areas(own, [one.localization.relocalized_area], f"{path}.localization.relocalized_area")
 

@@ -31,7 +31,12 @@ from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.relative_motion import is_wide
 from hmt_slam_ros.topological_inference.candidate_gating import Query
 from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch, Fit, SearchState
-from hmt_slam_ros.topological_inference.global_localization import LandmarkEvidence, PoseDistribution, PoseHint
+from hmt_slam_ros.topological_inference.global_localization import (
+    GlobalSearch,
+    LandmarkEvidence,
+    PoseDistribution,
+    PoseHint,
+)
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState, Lost, relative_covariance
 
 MIN_PROPOSAL_PROBABILITY = 0.5
@@ -171,27 +176,26 @@ class Branching:
         self.unstored_scans.update(state.unstored_scans)
 
     def localize_globally(
-        self, parent: Parent, poses: Mapping[int, Float64], before: int, pose_hint: PoseHint | None = None
+        self, parent: Parent, search: GlobalSearch, pose_hint: PoseHint | None = None
     ) -> PoseDistribution:
-        """The distribution of the keyframes' pose in the whole map.
+        """The distribution of the keyframes' pose in the whole map, as far as it was searched.
 
         Landmarks count from the second search with a candidate on, since one search alone localizes nobody.
 
-        :param poses: {keyframe: ``reference_T_base``}.
-        :param before: the map is that of the keyframes before this one.
         :param pose_hint: of the reference.
         """
-        distribution = self.search.localize_globally(parent.hybrid_map, poses, before, parent.clutter, pose_hint)
+        distribution = self.search.localize_globally(parent.hybrid_map, search, parent.clutter, pose_hint)
         lost = parent.state.localization
         if self.landmarks is None or not isinstance(lost, Lost) or lost.candidate is None:
             return distribution
-        return self.landmarks.weigh(distribution, parent.hybrid_map, poses, before)
+        return self.landmarks.weigh(distribution, parent.hybrid_map, search.poses, search.before)
 
     def look_ahead(self, parents: Sequence[Parent]) -> None:
         """Prepare the next search, at an event without one."""
-        self.search.look_ahead(max(parents, key=lambda parent: parent.log_weight).hybrid_map)
         localizations = [(parent.hybrid_map, parent.state.localization) for parent in parents]
         lost_maps = [(hybrid_map, lost.since) for hybrid_map, lost in localizations if isinstance(lost, Lost)]
+        if not lost_maps:
+            self.search.look_ahead(max(parents, key=lambda parent: parent.log_weight).hybrid_map)
         if lost_maps and self.landmarks is not None:
             self.landmarks.prepare_places(lost_maps)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,6 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import (
-    WHOLE_MAP_CACHE_BYTES,
     AreaPlace,
     GridCache,
     Neighborhood,
@@ -29,6 +28,7 @@ from hmt_slam_ros.registration.area_to_area import MatchMode, MatchSettings, mat
 from hmt_slam_ros.registration.consistency import MAP_IN_MAP, MAPS_OUTLIER_RATE, SCAN_IN_STORED_MAP, Clutter
 from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid, surface_points
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.sensors.relative_motion import is_wide
 from hmt_slam_ros.topological_inference.candidate_gating import (
     AreaCandidate,
     CandidateGating,
@@ -38,9 +38,18 @@ from hmt_slam_ros.topological_inference.candidate_gating import (
     entry_prior,
     transition_model,
 )
-from hmt_slam_ros.topological_inference.global_localization import PoseDistribution, PoseHint, localize_globally
+from hmt_slam_ros.topological_inference.global_localization import (
+    GlobalSearch,
+    PoseDistribution,
+    PoseHint,
+    begin_search,
+    continue_search,
+    is_conclusive,
+    localize_globally,
+)
 from hmt_slam_ros.topological_inference.global_scan_matching import FreeSpaceCheck, GlobalScanMatcher, query_bounds
 from hmt_slam_ros.topological_inference.place_recognition import (
+    MIN_LOG_RATIO,
     NegativeSample,
     PerceptualAliasing,
     ScanDescriptors,
@@ -108,6 +117,7 @@ class ClosureSearch:
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
         """:param scans: {keyframe: scan}, which may grow."""
         self._options = options = configuration.tsbi
+        self._filter = configuration.filter
         self.gating = CandidateGating(options)
         self.submap_radius = Neighborhood(options.local_sigma, options.local_reach)
         self._settings = MatchSettings.from_options(options)
@@ -115,7 +125,7 @@ class ClosureSearch:
         self._grid_cache = GridCache(scans, self._model, self.submap_radius)
         self._aliasing = PerceptualAliasing(options.aliasing_prior)
         self._descriptors = ScanDescriptors(scans)
-        self._whole_map_cache = GridCache(scans, self._model, self.submap_radius, WHOLE_MAP_CACHE_BYTES)
+        self._whole_map_cache = GridCache(scans, self._model, self.submap_radius)
         self._global_matcher = GlobalScanMatcher(
             self._whole_map_cache,
             FreeSpaceCheck(scans, configuration),
@@ -259,34 +269,56 @@ class ClosureSearch:
                 self._negative_sample(hybrid_map, area, excluded)
                 return
 
-    def localize_globally(
+    def begin_global_search(
         self,
         hybrid_map: HybridMap,
         poses: Mapping[int, Pose],
         before: int,
-        clutter: Clutter,
         pose_hint: PoseHint | None = None,
-    ) -> PoseDistribution:
-        """The distribution of the keyframes' pose in the whole map.
+        only: Collection[int] = (),
+    ) -> GlobalSearch:
+        """A search of the whole map, before its first region.
 
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
-        :param clutter: usual rate of contradictions of the robot's map.
         :param pose_hint: of the reference.
+        :param only: the only areas to search, since fewer keyframes fitted nowhere else; all if empty.
         """
         known = {area: [k for k in hybrid_map.keyframes(area) if k < before] for area in hybrid_map.area_ids()}
         known = {area: keyframes for area, keyframes in known.items() if keyframes}
-        return localize_globally(
-            self._global_matcher,
-            self._descriptors.area_probabilities(list(poses), known),
-            self._options.aliasing_prior,
-            hybrid_map,
-            poses,
-            before,
-            clutter,
-            pose_hint,
-            self._options.place_radius,
-        )
+        probabilities = self._descriptors.area_probabilities(list(poses), known)
+        return begin_search(hybrid_map, poses, before, probabilities, pose_hint, self._options.place_radius, only)
+
+    def continue_global_search(
+        self, hybrid_map: HybridMap, search: GlobalSearch, first: int | None = None
+    ) -> GlobalSearch:
+        """The search after one event.
+
+        :param first: the area whose region comes first, if it was not searched yet.
+        """
+        return continue_search(search, self._global_matcher, hybrid_map, first)
+
+    def is_conclusive(
+        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
+    ) -> bool:
+        """Whether the search is over.
+
+        :param clutter: usual rate of contradictions of the robot's map.
+        :param pose_hint: of the reference.
+        """
+        probability = self._options.relocalization_probability
+        return is_conclusive(search, self._options.aliasing_prior, hybrid_map, clutter, pose_hint, probability)
+
+    def localize_globally(
+        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
+    ) -> PoseDistribution:
+        """The distribution of the keyframes' pose in the whole map, as far as it was searched.
+
+        :param clutter: usual rate of contradictions of the robot's map.
+        :param pose_hint: of the reference.
+        """
+        prior = self._options.aliasing_prior
+        return localize_globally(search, self._global_matcher, prior, hybrid_map, clutter, pose_hint)
 
     def end_global_localization(self) -> None:
         """Free the grids of the whole map, which take as much memory as a large building's submaps."""
@@ -310,11 +342,15 @@ class ClosureSearch:
     def _modes(self, place: AreaPlace, candidate: AreaCandidate) -> list[MatchMode] | None:
         """The modes in the candidate's place; None where the heaviest lies beside every place.
 
-        A robot that returns to known ground sees it before it is in it.
+        A robot that returns to known ground sees it before it is in it. A wide prior admits poses that fit by chance,
+        and takes longest: of these, those count only with which more surfaces match than anywhere.
         """
         query, radius = self._grid_cache.grid(candidate.unmatched_poses), self._options.place_radius
         bounds = query_bounds(place.positions, query, candidate.unmatched_poses, radius)
-        modes = match_areas(query, place.grid, candidate.prior, self._settings, bounds).modes
+        settings = self._settings
+        if is_wide(candidate.prior.covariance, self._filter):
+            settings = replace(settings, min_log_ratio=MIN_LOG_RATIO)
+        modes = match_areas(query, place.grid, candidate.prior, settings, bounds).modes
         poses = stack_poses(candidate.unmatched_poses)
         areas = [containing_area(place, se2.compose(mode.pose.mean, poses), radius) for mode in modes]
         if modes and areas[max(range(len(modes)), key=lambda n: modes[n].log_mass)] is None:

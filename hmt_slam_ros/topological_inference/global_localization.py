@@ -8,11 +8,12 @@ all headings. Each search computes the probabilities again from the same prior, 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy.special import softmax
 
 from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.geometry import se2
@@ -44,6 +45,9 @@ _MIN_WALL_CHECK_PROBABILITY = 0.05
 
 _OLD_MAP_FACTOR = 2.0
 """Ratio of the outlier rates of walls in an old map and in a recent one: people stood elsewhere."""
+
+_EVENT_WORK = 8_000_000
+"""Work of a search after which an event begins no further region: samples looked up, about 20 ms."""
 
 _HINT_DEVIATIONS = 4.0
 """Deviations of a pose hint beyond which no area is searched."""
@@ -115,67 +119,173 @@ class PoseDistribution(NamedTuple):
         return PoseDistribution(self.candidates, weights / (rest + weights.sum()))
 
 
-def localize_globally(
-    matcher: GlobalScanMatcher,
-    area_probabilities: Mapping[int, float],
-    aliasing_prior: float,
+@dataclass(frozen=True, eq=False)
+class GlobalSearch:
+    """A search of the whole map for some keyframes, region by region, which goes on from event to event.
+
+    :ivar poses: {keyframe: ``reference_T_base``, shape (3,)}, ascending; the reference is the first.
+    :ivar before: the map is that of the keyframes before this one.
+    :ivar areas: number of areas to search.
+    :ivar unexamined: {area: probability by its appearance} of those that were not searched yet.
+    :ivar candidates: what was found.
+    :ivar fitting_areas: the areas of the candidates' regions, and those around: a robot drives on.
+    """
+
+    poses: Mapping[int, Pose]
+    before: int
+    areas: int
+    unexamined: Mapping[int, float]
+    candidates: tuple[PoseCandidate, ...] = ()
+    fitting_areas: frozenset[int] = frozenset()
+
+    @property
+    def best_share(self) -> float:
+        """The largest matched share of the candidates."""
+        return max((candidate.agreement.matched_share for candidate in self.candidates), default=0.0)
+
+
+def begin_search(
     hybrid_map: HybridMap,
     poses: Mapping[int, Pose],
     before: int,
-    clutter: Clutter,
+    area_probabilities: Mapping[int, float],
     pose_hint: PoseHint | None = None,
     radius: float = 0.0,
+    only: Collection[int] = (),
+) -> GlobalSearch:
+    """The search before its first region.
+
+    :param poses: {keyframe: ``reference_T_base`` (3,)}.
+    :param before: the map is that of the keyframes before this one.
+    :param area_probabilities: {area: probability by its appearance} of all known areas.
+    :param pose_hint: of the reference; it excludes areas that are farther away.
+    :param radius: largest distance to a keyframe of an area's place, m.
+    :param only: the only areas to search, since fewer keyframes fitted nowhere else; all if empty.
+    """
+    near = None if pose_hint is None else _areas_near_hint(hybrid_map, pose_hint, radius, before)
+    areas = {area: p for area, p in area_probabilities.items() if near is None or area in near}
+    unexamined = {area: p for area, p in areas.items() if not only or area in only}
+    return GlobalSearch(poses, before, len(areas), unexamined)
+
+
+def continue_search(
+    search: GlobalSearch, matcher: GlobalScanMatcher, hybrid_map: HybridMap, first: int | None = None
+) -> GlobalSearch:
+    """The search after the regions of one event, the most probable by their appearance.
+
+    It ends with the region that exceeds the work of an event. Areas that the map lacks by now are dropped.
+
+    :param first: the area whose region comes first, if it was not searched yet.
+    """
+    candidates = tuple(candidate for candidate in search.candidates if hybrid_map.has_area(candidate.area))
+    unexamined = {area: p for area, p in search.unexamined.items() if hybrid_map.has_area(area)}
+    search, work = replace(search, candidates=candidates, unexamined=unexamined), 0
+    while search.unexamined and work < _EVENT_WORK:
+        probabilities = dict(search.unexamined)
+        if first is not None and first in probabilities:
+            probabilities[first] = 1.0
+        match = matcher.match_region(hybrid_map, search.poses, search.before, probabilities, search.best_share)
+        search = replace(
+            search,
+            unexamined={area: p for area, p in search.unexamined.items() if area not in match.areas},
+            candidates=search.candidates + match.candidates,
+            fitting_areas=search.fitting_areas | (match.around if match.candidates else frozenset()),
+        )
+        work += match.work
+    return search
+
+
+def localize_globally(
+    search: GlobalSearch,
+    matcher: GlobalScanMatcher,
+    aliasing_prior: float,
+    hybrid_map: HybridMap,
+    clutter: Clutter,
+    pose_hint: PoseHint | None = None,
 ) -> PoseDistribution:
-    """The distribution of the pose of some keyframes in the whole map.
+    """The distribution of the pose of some keyframes in the whole map, as far as it was searched.
+
+    For probable candidates, walls that beams pass count against them. What was not searched belongs to the rest.
+
+    :param aliasing_prior: prior probability that keyframes match an area in which they do not lie.
+    :param clutter: usual rate of contradictions of the robot's map, where that is above the rate of maps.
+    :param pose_hint: of the reference.
+    """
+    candidates = search.candidates
+    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint)
+    wall_rate = max(WALLS_OUTLIER_RATE, _OLD_MAP_FACTOR * clutter.wall_outlier_rate)
+    for n in np.flatnonzero(_probabilities(log_weights, log_rest) >= _MIN_WALL_CHECK_PROBABILITY):
+        walls = matcher.check_walls(hybrid_map, candidates[n], search.poses, search.before)
+        # Walls without violations add nothing to the surfaces, so they only count against a candidate.
+        log_weights[n] += min(0.0, WALLS_OF_MAP.log_likelihood_ratio(walls, wall_rate))
+    return PoseDistribution(candidates, _probabilities(log_weights, log_rest))
+
+
+def is_conclusive(
+    search: GlobalSearch,
+    aliasing_prior: float,
+    hybrid_map: HybridMap,
+    clutter: Clutter,
+    pose_hint: PoseHint | None,
+    probability: float,
+) -> bool:
+    """Whether the search is over: all areas were searched, or a candidate is probable in spite of those that were not.
+
+    :param probability: of such a candidate, before walls count against it.
+    """
+    if not search.unexamined:
+        return True
+    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint)
+    return bool(_probabilities(log_weights, log_rest).max(initial=0.0) >= probability)
+
+
+def _log_weights(
+    search: GlobalSearch, aliasing_prior: float, hybrid_map: HybridMap, clutter: Clutter, pose_hint: PoseHint | None
+) -> tuple[list[float], float]:
+    """Log of the weight of every candidate, and of the rest: unmapped ground, and the areas that were not searched.
 
     The best matches in the other areas show how distinctive a match is. Whether the keyframes are in the map at all is
     tested with the best match. Between candidates the surfaces also count that are known at one and not at the other.
-    For probable candidates, walls that beams pass count against them. A pose hint replaces the flat prior by one as
-    wide as its covariance, and excludes areas that are farther away.
-
-    :param area_probabilities: {area: probability by its appearance} of all known areas.
-    :param aliasing_prior: prior probability that keyframes match an area in which they do not lie.
-    :param poses: {keyframe: ``reference_T_base`` (3,)}.
-    :param before: the map is that of the keyframes before this one.
-    :param clutter: usual rate of contradictions of the robot's map, where that is above the rate of maps.
-    :param pose_hint: of the reference.
-    :param radius: largest distance to a keyframe of an area's place, m.
+    A pose hint replaces the flat prior by one as wide as its covariance. In an area that was not searched keyframes
+    may match as well as at the best candidate, which is there by chance then, as improbable as it is distinctive.
     """
-    near = None if pose_hint is None else _areas_near_hint(hybrid_map, pose_hint, radius, before)
-    areas = [area for area in area_probabilities if near is None or area in near]
-    candidates = matcher.match_regions(hybrid_map, poses, before, {area: area_probabilities[area] for area in areas})
     log_mass: dict[int, float] = {}
-    for candidate in candidates:
+    for candidate in search.candidates:
         log_mass[candidate.area] = float(np.logaddexp(log_mass.get(candidate.area, -math.inf), candidate.mode.log_mass))
     max_log_mass = max(log_mass.values(), default=0.0)
-    log_flat = math.log((1.0 - UNMAPPED_PRIOR) / max(1, len(areas)))
-    best_shares = {
-        area: max((c.agreement.matched_share for c in candidates if c.area == area), default=0.0) for area in areas
-    }
+    log_flat = math.log((1.0 - UNMAPPED_PRIOR) / max(1, search.areas))
+    log_priors = _log_hint_priors(search, hybrid_map, pose_hint) if pose_hint else {}
     outlier_rate = max(MAPS_OUTLIER_RATE, clutter.beam_outlier_rate)
     aliasing = PerceptualAliasing(aliasing_prior)
-    aliasing.add_negatives(sorted(best_shares.values())[:-1])
-    log_weights = [
-        (log_flat if pose_hint is None or near is None else _log_hint_prior(pose_hint, near[c.area], c))
-        + c.mode.log_mass
-        - log_mass[c.area]
-        + _SURFACE_WEIGHT * (log_mass[c.area] - max_log_mass)
-        + MAP_IN_MAP.log_likelihood_ratio(c.agreement, outlier_rate)
-        + aliasing.log_distinctiveness(c.agreement.matched_share, already_expected=False)
-        for c in candidates
-    ]
-    wall_rate = max(WALLS_OUTLIER_RATE, _OLD_MAP_FACTOR * clutter.wall_outlier_rate)
-    for n in np.flatnonzero(_probabilities(log_weights) >= _MIN_WALL_CHECK_PROBABILITY):
-        walls = matcher.check_walls(hybrid_map, candidates[n], poses, before)
-        # Walls without violations add nothing to the surfaces, so they only count against a candidate.
-        log_weights[n] += min(0.0, WALLS_OF_MAP.log_likelihood_ratio(walls, wall_rate))
-    return PoseDistribution(tuple(candidates), _probabilities(log_weights))
+    aliasing.add_negatives(_other_shares(search))
+    log_weights, log_chance = [], 0.0
+    for n, c in enumerate(search.candidates):
+        log_there = (
+            c.mode.log_mass
+            - log_mass[c.area]
+            + _SURFACE_WEIGHT * (log_mass[c.area] - max_log_mass)
+            + MAP_IN_MAP.log_likelihood_ratio(c.agreement, outlier_rate)
+        )
+        distinctiveness = aliasing.log_distinctiveness(c.agreement.matched_share, already_expected=False)
+        log_weights.append(log_priors.get(n, log_flat) + log_there + distinctiveness)
+        log_chance = max(log_chance, log_there)
+    unexamined = (1.0 - UNMAPPED_PRIOR) * sum(search.unexamined.values())
+    log_unexamined = math.log(max(unexamined, _MIN_PROBABILITY)) + log_chance
+    return log_weights, float(np.logaddexp(math.log(UNMAPPED_PRIOR), log_unexamined))
 
 
-def _probabilities(log_weights: Sequence[float]) -> Float64:
-    """Probabilities of candidates beside unmapped ground, shape (len(log_weights),)."""
-    weights = np.exp(np.array([*log_weights, math.log(UNMAPPED_PRIOR)]))
-    return (weights / weights.sum())[:-1]
+def _other_shares(search: GlobalSearch) -> list[float]:
+    """The largest matched share in every area that was searched, ascending, without the largest of all."""
+    best: dict[int, float] = {}
+    for candidate in search.candidates:
+        best[candidate.area] = max(best.get(candidate.area, 0.0), candidate.agreement.matched_share)
+    without = search.areas - len(search.unexamined) - len(best)
+    return [*[0.0] * without, *sorted(best.values())][:-1]
+
+
+def _probabilities(log_weights: Sequence[float], log_rest: float) -> Float64:
+    """Probabilities of candidates beside the rest, shape (len(log_weights),)."""
+    return np.asarray(softmax(np.array([*log_weights, log_rest]))[:-1], dtype=np.float64)
 
 
 def _areas_near_hint(hybrid_map: HybridMap, pose_hint: PoseHint, radius: float, before: int) -> dict[int, PoseGaussian]:
@@ -193,15 +303,19 @@ def _areas_near_hint(hybrid_map: HybridMap, pose_hint: PoseHint, radius: float, 
     return near
 
 
-def _log_hint_prior(pose_hint: PoseHint, belief: PoseGaussian, candidate: PoseCandidate) -> float:
-    """Log-prior of a candidate by a pose hint, relative to the best that there could be.
-
-    :param belief: over ``hint_area_T_area`` of the candidate's area.
-    """
-    pose = belief.compose(candidate.mode.measured)
-    difference = se2.log(se2.between(pose_hint.pose.mean, pose.mean))
-    distance = float(difference @ np.linalg.solve(pose_hint.pose.covariance + pose.covariance, difference))
-    return math.log(1.0 - UNMAPPED_PRIOR) - 0.5 * distance
+def _log_hint_priors(search: GlobalSearch, hybrid_map: HybridMap, pose_hint: PoseHint) -> dict[int, float]:
+    """Log-priors of the candidates, by their number, by a pose hint, relative to the best that there could be."""
+    if not hybrid_map.has_area(pose_hint.area):
+        return {}
+    beliefs = connected_areas(hybrid_map, pose_hint.area)
+    priors = {}
+    for n, candidate in enumerate(search.candidates):
+        if candidate.area in beliefs:
+            pose = beliefs[candidate.area].compose(candidate.mode.measured)
+            difference = se2.log(se2.between(pose_hint.pose.mean, pose.mean))
+            distance = float(difference @ np.linalg.solve(pose_hint.pose.covariance + pose.covariance, difference))
+            priors[n] = math.log(1.0 - UNMAPPED_PRIOR) - 0.5 * distance
+    return priors
 
 
 class LandmarkEvidence(Protocol):

@@ -10,7 +10,7 @@ keyframes would be near one of the map.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,16 +22,18 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import (
+    NO_AREA,
     AreaPlace,
     GridCache,
     Neighborhood,
     areas_around,
     containing_area,
     keyframe_positions,
+    keyframes_before,
     min_distance,
     stack_poses,
 )
-from hmt_slam_ros.registration.area_to_area import MatchMode, MatchSettings, match_areas
+from hmt_slam_ros.registration.area_to_area import MatchMode, MatchSettings, find_cells, match_areas
 from hmt_slam_ros.registration.branch_and_bound import constrain_around
 from hmt_slam_ros.registration.consistency import Agreement, count_hits_and_violations
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
@@ -52,8 +54,14 @@ _REGION_SIGMA = 1.0
 _FLAT = PoseGaussian(np.zeros(3), np.diag([100.0, 100.0, 20.0]) ** 2)
 """Prior that is flat over a region and all headings, m and rad."""
 
+_NO_POINTS = np.zeros((0, 2))
+"""No samples of the map, since known surface in free space of the keyframes does not count."""
+
 _SAMPLE_STRIDE = 3
-"""One of so many surface samples is matched."""
+"""One of so many surface samples is matched, or fewer."""
+
+_MAX_SAMPLES = 160
+"""Most samples that are matched: more keyframes do not take longer."""
 
 _SURFACE_LOG_RATIO = math.log(3.0)
 """Log-ratio of a sample amid a known surface, nats; beside its middle it is smaller."""
@@ -70,6 +78,9 @@ those in free space count against a match: so also matches are dropped whose sha
 
 _MAX_MATCHES = 40
 """Most matches per region."""
+
+_CELL_WORK = 20
+"""Work of a cell of a region's map, which may have to be built: in the time of so many samples."""
 
 
 class PoseCandidate(NamedTuple):
@@ -158,14 +169,27 @@ def _count_in_map(
 class Region(NamedTuple):
     """Areas that are searched together.
 
-    :ivar reference: one of them.
     :ivar poses: {area: ``reference_T_area``} of all that the region's map holds.
     :ivar own_areas: the areas that are searched here; the others belong to other regions.
     """
 
-    reference: int
     poses: dict[int, Pose]
     own_areas: frozenset[int]
+
+
+class RegionMatch(NamedTuple):
+    """The matches of keyframes into a region.
+
+    :ivar areas: that were searched.
+    :ivar around: all that the region's map holds.
+    :ivar candidates: each in the frame of its area.
+    :ivar work: of search and map, the number of samples looked up.
+    """
+
+    areas: frozenset[int]
+    around: frozenset[int]
+    candidates: tuple[PoseCandidate, ...]
+    work: int
 
 
 class GlobalScanMatcher:
@@ -186,30 +210,31 @@ class GlobalScanMatcher:
         self._grid_cache, self._free_space_check = grid_cache, free_space_check
         self._settings, self._radius, self._reach = settings, radius, reach
 
-    def match_regions(
-        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], before: float, area_probabilities: Mapping[int, float]
-    ) -> list[PoseCandidate]:
-        """The best match of the keyframes into some areas, and those that matter beside it.
+    def match_region(
+        self,
+        hybrid_map: HybridMap,
+        poses: Mapping[int, Pose],
+        before: float,
+        unexamined: Mapping[int, float],
+        best_share: float,
+    ) -> RegionMatch:
+        """The best match of the keyframes into the region of the most probable area, and those that matter beside it.
 
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
-        :param area_probabilities: {area: probability by its appearance} of the areas; the most probable comes first.
+        :param unexamined: {area: probability} of the areas that were not searched yet, at least one.
+        :param best_share: largest matched share in those that were.
         """
-        candidates: list[PoseCandidate] = []
         query = replace(self._grid_cache.grid(poses), points=self._grid_cache.static_points(poses))
-        known = [area for area in hybrid_map.area_ids() if min(hybrid_map.keyframes(area), default=before) < before]
-        searched = [r for r in regions(hybrid_map, known, self._reach) if r.own_areas & area_probabilities.keys()]
-        searched.sort(key=lambda r: (-sum(area_probabilities.get(a, 0.0) for a in r.own_areas), r.reference))
-        for region in searched:
-            best_share = max((candidate.agreement.matched_share for candidate in candidates), default=0.0)
-            min_log_ratio = max(_MIN_LOG_RATIO, (best_share - _SHARE_MARGIN) * _SURFACE_LOG_RATIO)
-            place = self._grid_cache.place_among(hybrid_map, region.reference, region.poses, before)
-            areas = region.own_areas & area_probabilities.keys()
-            candidates += [
-                candidate._replace(mode=_mode_in_frame(candidate.mode, region.poses[candidate.area]))
-                for candidate in self._match_region(place, query, poses, areas, min_log_ratio)
-            ]
-        return candidates
+        older = [area for area in hybrid_map.area_ids() if min(hybrid_map.keyframes(area), default=before) < before]
+        reference = min(unexamined, key=lambda area: (-unexamined[area], area))
+        region = region_around(hybrid_map, reference, older, unexamined.keys(), self._reach)
+        min_log_ratio = max(_MIN_LOG_RATIO, (best_share - _SHARE_MARGIN) * _SURFACE_LOG_RATIO)
+        known, areas = keyframes_before(hybrid_map, region.poses, before)
+        keyframe_areas = np.array(areas, dtype=np.int64)
+        candidates, work = self._match_keyframes(known, keyframe_areas, query, poses, region.own_areas, min_log_ratio)
+        in_frames = [c._replace(mode=_mode_in_frame(c.mode, region.poses[c.area])) for c in candidates]
+        return RegionMatch(region.own_areas, frozenset(region.poses), tuple(in_frames), work)
 
     def check_walls(
         self, hybrid_map: HybridMap, candidate: PoseCandidate, poses: Mapping[int, Pose], before: float
@@ -229,53 +254,71 @@ class GlobalScanMatcher:
             known, {k: se2.compose(candidate.mode.pose.mean, pose) for k, pose in poses.items()}
         )
 
-    def _match_region(
-        self, place: AreaPlace, query: AreaGrid, poses: Mapping[int, Pose], areas: Collection[int], min_log_ratio: float
-    ) -> Iterator[PoseCandidate]:
-        """Matches of the keyframes into areas of a region, in the frame of its reference.
+    def _match_keyframes(
+        self,
+        known: Mapping[int, Pose],
+        keyframe_areas: Int64,
+        query: AreaGrid,
+        poses: Mapping[int, Pose],
+        areas: Collection[int],
+        min_log_ratio: float,
+    ) -> tuple[list[PoseCandidate], int]:
+        """Matches of the keyframes into a region, in its frame, and the work.
 
+        The whole map of the region is built where something fits only.
+
+        :param known: {keyframe: ``region_T_base``} of the map.
+        :param keyframe_areas: shape (len(known),), the area of each.
         :param query: grid of the keyframes.
+        :param areas: those that are searched.
         :param min_log_ratio: smallest mean log-ratio of the samples, nats.
         """
-        sparse_query, sparse_map = (replace(grid, points=grid.points[::_SAMPLE_STRIDE]) for grid in (query, place.grid))
-        temper = _SAMPLE_STRIDE * self._settings.temper
+        stride = max(_SAMPLE_STRIDE, math.ceil(len(query.points) / _MAX_SAMPLES))
+        sparse = replace(query, points=query.points[::stride])
+        surface, positions = self._grid_cache.coarse_grid(known), stack_poses(known)[:, :2]
+        temper = stride * self._settings.temper
         settings = replace(
             self._settings,
             temper=temper,
-            margin=max(self._settings.margin, _SHARE_MARGIN * _SURFACE_LOG_RATIO * temper * len(sparse_query.points)),
+            margin=max(self._settings.margin, _SHARE_MARGIN * _SURFACE_LOG_RATIO * temper * len(sparse.points)),
             min_log_ratio=min_log_ratio,
             max_modes=_MAX_MATCHES,
             check_reverse=False,
         )
-        positions = place.positions[np.isin(place.keyframe_areas, list(areas))]
-        constraint = constrain_around(positions, stack_poses(poses)[:, :2], self._radius, place.grid.cell)
-        bounds = query_bounds(positions, query, poses, self._radius)
-        for mode in match_areas(sparse_query, sparse_map, _FLAT, settings, bounds, constraint).modes:
+        is_searched = np.isin(keyframe_areas, list(areas))
+        constraint = constrain_around(positions, is_searched, stack_poses(poses)[:, :2], self._radius, surface.cell)
+        bounds = query_bounds(positions[is_searched], query, poses, self._radius)
+        cells = find_cells(sparse, surface, _NO_POINTS, _FLAT, settings, bounds, constraint)
+        work = cells.work + _CELL_WORK * surface.log_ratio.size
+        if not cells.score.size:
+            return [], work
+        place = AreaPlace(NO_AREA, keyframe_areas, positions, self._grid_cache.grid(known))
+        candidates = []
+        for mode in match_areas(sparse, place.grid, _FLAT, settings, bounds, cells).modes:
             area = containing_area(place, se2.compose(mode.pose.mean, stack_poses(poses)), self._radius)
             if area is not None and area in areas:
-                yield PoseCandidate(area, mode, place.grid.compare(query.points, mode.pose.mean))
+                candidates.append(PoseCandidate(area, mode, place.grid.compare(query.points, mode.pose.mean)))
+        return candidates, work
 
 
-def regions(hybrid_map: HybridMap, areas: Collection[int], reach: float) -> list[Region]:
-    """The regions of a map; each area is searched in one of them.
+def region_around(
+    hybrid_map: HybridMap, reference: int, known: Collection[int], unexamined: Collection[int], reach: float
+) -> Region:
+    """The region of an area.
 
+    :param known: the areas that a region may hold.
+    :param unexamined: those of them that no other region searched.
     :param reach: largest distance between keyframes of two areas of a region, m; its map reaches as far beyond.
     """
-    found, remaining = [], set(areas)
-    for area in sorted(areas):
-        if area not in remaining:
-            continue
-        around = areas_around(hybrid_map, area, _region_neighborhood(reach))
-        poses = {other: belief.mean for other, belief in around.items() if other in areas}
-        positions = keyframe_positions(hybrid_map, area)
-        own_areas = {
-            other
-            for other in remaining & poses.keys()
-            if min_distance(positions, keyframe_positions(hybrid_map, other, poses[other])) <= reach
-        }
-        remaining -= own_areas
-        found.append(Region(area, poses, frozenset(own_areas)))
-    return found
+    around = areas_around(hybrid_map, reference, _region_neighborhood(reach))
+    poses = {other: belief.mean for other, belief in around.items() if other in known}
+    positions = keyframe_positions(hybrid_map, reference)
+    own_areas = {
+        other
+        for other in poses.keys() & set(unexamined)
+        if min_distance(positions, keyframe_positions(hybrid_map, other, poses[other])) <= reach
+    }
+    return Region(poses, frozenset(own_areas))
 
 
 def _region_neighborhood(reach: float) -> Neighborhood:

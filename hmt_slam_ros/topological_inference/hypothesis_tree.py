@@ -15,7 +15,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, AreaPair, HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
-from hmt_slam_ros.topological_inference.global_localization import PoseHint
+from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseHint
 
 Covariance = Float64
 
@@ -148,7 +148,11 @@ class Lost:
     :ivar false_alarm: the alternative to a kidnapping, in localization; else None.
     :ivar pose_hint: for one of the keyframes since then; else None.
     :ivar candidate: the pose that the last search found, if it did.
+    :ivar fitting_areas: the areas that fitted in that search; the next one confirms or refutes the candidate there.
     :ivar tracked_pose: the pose at ``since`` without a kidnapping, in mapping; else None.
+    :ivar search: of the map, while it goes on; else None.
+    :ivar searched: the newest keyframe of the last search, -1 before the first.
+    :ivar unknown: the newest keyframe of those that are on unmapped ground for certain, -1 for none.
     :ivar counted_evidence: log Bayes factor for a pose elsewhere that is in the hypothesis's weight, nats; None after
         a relocalized hypothesis was split off.
     :ivar kind: distinguishes it from ``Tracking`` in a document.
@@ -158,7 +162,11 @@ class Lost:
     false_alarm: FalseAlarm | None = None
     pose_hint: PoseHint | None = None
     candidate: PoseInArea | None = None
+    fitting_areas: frozenset[int] = frozenset()
     tracked_pose: PoseInArea | None = None
+    search: GlobalSearch | None = None
+    searched: int = -1
+    unknown: int = -1
     counted_evidence: float | None = 0.0
     kind: Literal["lost"] = "lost"
 

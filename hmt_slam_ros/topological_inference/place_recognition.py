@@ -61,7 +61,7 @@ _GATE = 6.25
 _MARGIN = 1.0
 """Margin of a search for the best match only, nats."""
 
-_MIN_LOG_RATIO = 0.25 * math.log(3.0)
+MIN_LOG_RATIO = 0.25 * math.log(3.0)
 """Smallest mean log-ratio of a match, nats: a quarter of the samples on surfaces matches anywhere."""
 
 _PRIOR_COUNT = 2.0
@@ -167,7 +167,7 @@ def best_shares(query: AreaGrid, negatives: Iterable[NegativeSample], settings: 
 
     :param query: grid of the keyframes, in the frame of the first of them.
     """
-    settings = replace(settings, gate=_GATE, margin=_MARGIN, min_log_ratio=_MIN_LOG_RATIO)
+    settings = replace(settings, gate=_GATE, margin=_MARGIN, min_log_ratio=MIN_LOG_RATIO)
     shares = []
     for place in negatives:
         matches = [

@@ -1,18 +1,15 @@
 """Lost hypotheses: how the robot becomes lost, and how it is relocalized.
 
-A lost robot maps around itself. It begins a new area, to which an uninformative arc leads. All keyframes since then
-are searched in the whole map, again and again. A pose is accepted with enough probability in two searches in a row, or
-in one that agrees with a pose hint. Then a child closes the loop between the two maps, and TLCA decides on it.
-
-Kidnapping: odometry can fail (slip, lost readings, a kidnapped robot). The scans then contradict the submap, from which
-a CUSUM test gives the log-odds (``HypothesisState.kidnapping_test``). If they suffice, a kidnapped child is spawned,
-whose keyframes since the kidnapping begin a new area.
+A lost robot maps around itself. It begins a new area, to which an uninformative arc leads. Its keyframes are searched
+in the whole map, again and again, a few regions at each event. A pose is accepted with enough probability in two
+searches in a row, or in one that agrees with a pose hint. Then a child closes the loop between the two maps, and TLCA
+decides on it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -26,9 +23,9 @@ from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative, shortest_pat
 from hmt_slam_ros.messages.map_changes import Arc, InitialPose
 from hmt_slam_ros.messages.messages import Keyframe
 from hmt_slam_ros.topological_inference.branching import Branches, Branching, Child, Parent
-from hmt_slam_ros.topological_inference.global_localization import PoseDistribution, PoseHint
+from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseDistribution, PoseHint
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate, is_certain
-from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, Lost, PoseInArea, Tracking
+from hmt_slam_ros.topological_inference.hypothesis_tree import Lost, PoseInArea, Tracking
 
 Pose = Float64
 
@@ -55,12 +52,6 @@ _PROBABILITY_FLOOR = 1e-12
 
 _MAX_KEYFRAMES = 40
 """Most keyframes that are searched in the map, the newest."""
-
-_MIN_KIDNAPPED_PROBABILITY = 0.05
-"""Smallest probability of a hypothesis that spawns a kidnapped child."""
-
-_MIN_KIDNAPPED_KEYFRAMES = 3
-"""Fewest keyframes since the kidnapping of a kidnapped child (docs/decisions/0026-kidnapping-detection.md)."""
 
 
 def begin_relocalization(branching: Branching, parent: Parent, keyframe: Keyframe, pose: Pose) -> Branches:
@@ -109,7 +100,8 @@ def _enter_unknown_area(
     origin = PoseGaussian.from_pose(np.zeros(3))
     child = branching.enter_area(parent, query, branching.new_area(parent, query), origin, arc, 0.0)
     before = child.state.localization
-    lost = replace(before if isinstance(before, Lost) else Lost(keyframe), since=keyframe, pose_hint=hint)
+    before = before if isinstance(before, Lost) else Lost(keyframe)
+    lost = replace(before, since=keyframe, pose_hint=hint, search=None)
     return Branches([replace(child, state=replace(child.state, localization=lost))])
 
 
@@ -126,7 +118,8 @@ def _relocalize_at_hint(
     newest = max(keyframes)
     scan_T_newest = PoseGaussian.from_pose(se2.between(pose, keyframes[newest]))
     hint = PoseHint(newest, initial_pose.area, initial_pose.pose.compose(scan_T_newest))
-    hinted = _with_localization(parent, replace(lost, pose_hint=hint, false_alarm=None))
+    lost = replace(lost, pose_hint=hint, false_alarm=None, search=None, fitting_areas=frozenset(), unknown=-1)
+    hinted = _with_localization(parent, lost)
     branches = update_relocalization(branching, hinted)
     arcs = _hinted_arcs(parent, lost.since, hint, keyframes[newest])
     return branches._replace(children=[replace(child, arcs=child.arcs or arcs) for child in branches.children])
@@ -151,40 +144,103 @@ def _hinted_arcs(parent: Parent, since: int, pose_hint: PoseHint, pose: Pose) ->
     return ()
 
 
+def is_search_due(parent: Parent, options: InferenceParameters) -> bool:
+    """Whether a lost hypothesis has enough keyframes since the last search for another one."""
+    lost = parent.state.localization
+    if not isinstance(lost, Lost) or lost.search is not None:
+        return False
+    newer = _poses_since(parent, max(lost.since, lost.searched + 1))
+    return len(newer) >= (options.recheck_keyframes if lost.pose_hint is None else 1)
+
+
+def is_searching(parent: Parent) -> bool:
+    """Whether a search for a lost hypothesis goes on."""
+    lost = parent.state.localization
+    return isinstance(lost, Lost) and lost.search is not None
+
+
 def update_relocalization(branching: Branching, parent: Parent) -> Branches:
-    """The children of a lost hypothesis after a search: still lost, or relocalized.
+    """The children of a lost hypothesis after the search of an event: still lost, or relocalized.
 
     :param parent: a lost hypothesis.
     """
     lost = parent.state.localization
     assert isinstance(lost, Lost)
-    keyframes = _poses_since(parent, lost.since)
+    search = lost.search or _begin_search(branching, parent, lost)
+    first = None if lost.candidate is None else lost.candidate.area
+    search = branching.search.continue_global_search(parent.hybrid_map, search, first)
+    searching = [_child_with_localization(parent, replace(lost, search=search))]
+    hint = _hint_of_first(lost, search.poses)
+    if not branching.search.is_conclusive(parent.hybrid_map, search, parent.clutter, hint):
+        return Branches(searching)
+    after = replace(lost, search=None, searched=max(search.poses))
+    branches = _conclude_search(branching, parent, after, search, hint)
+    # Walls and the odds of a kidnapping may count against a candidate: the rest is searched first then.
+    is_refuted = all(_is_without_candidate(child) for child in branches.children)
+    return Branches(searching) if search.unexamined and is_refuted else branches
+
+
+def _is_without_candidate(child: Child) -> bool:
+    localization = child.state.localization
+    return isinstance(localization, Lost) and localization.candidate is None
+
+
+def _begin_search(branching: Branching, parent: Parent, lost: Lost) -> GlobalSearch:
+    """A search for the newest keyframes but those on unmapped ground; with a candidate, where the last one fitted."""
+    keyframes = _poses_since(parent, max(lost.since, lost.unknown + 1))
     reference = next(iter(keyframes.values()))
     poses = {k: se2.between(reference, pose) for k, pose in keyframes.items()}
-    hint = _hint_of_first(lost, keyframes)
-    is_kidnapped = lost.tracked_pose is not None
-    distribution = branching.localize_globally(parent, poses, lost.since, hint)
+    hint = _hint_of_first(lost, poses)
+    return branching.search.begin_global_search(parent.hybrid_map, poses, lost.since, hint, lost.fitting_areas)
+
+
+def _conclude_search(
+    branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch, hint: PoseHint | None
+) -> Branches:
+    """The children after a search: still lost, or relocalized.
+
+    :param lost: the state after it.
+    :param hint: for the reference of the search.
+    """
+    poses, keyframes = search.poses, _poses_since(parent, lost.since)
+    common = keyframes.keys() & poses.keys()
+    if not common:
+        return Branches([_child_with_localization(parent, lost)])
+    newest, is_kidnapped = max(common), lost.tracked_pose is not None
+    distribution = branching.localize_globally(parent, search, hint)
     if is_kidnapped:
         distribution = distribution.with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
     distribution = _with_false_alarm(parent.hybrid_map, lost, distribution, poses)
-    parent = replace(parent, state=parent.state.after_matching((), tuple(poses)))
     parent, lost = _reweight_by_evidence(parent, lost, distribution, poses)
-    unmapped = 1.0 - _REFUTING_PROBABILITY
-    if len(keyframes) >= _REFUTING_KEYFRAMES and float(distribution.probabilities.sum()) < unmapped:
-        lost = replace(lost, pose_hint=None)
+    lost = _after_refutation(lost, distribution, poses)
     best = distribution.best
     if best is None or not _is_decisive(*best, branching.options, is_kidnapped=is_kidnapped):
-        children = [_child_with_localization(parent, replace(lost, candidate=None))]
+        children = [_child_with_localization(parent, replace(lost, candidate=None, fitting_areas=frozenset()))]
         return Branches(children, True, pose_distribution=distribution)
     candidate, probability = best
-    with_candidate = replace(lost, candidate=_pose_in_area(candidate, poses, max(poses)))
+    with_candidate = replace(
+        lost, candidate=_pose_in_area(candidate, poses, max(poses)), fitting_areas=search.fitting_areas
+    )
     if (hint is not None and probability >= branching.options.hint_probability) or _confirms_candidate(
         parent.hybrid_map, lost, candidate, poses
     ):
+        reference = se2.compose(keyframes[newest], se2.inverse(poses[newest]))
         children = _split_at_candidate(parent, with_candidate, reference, candidate, probability)
     else:
         children = [_child_with_localization(parent, with_candidate)]
     return Branches(children, True, pose_distribution=distribution)
+
+
+def _after_refutation(lost: Lost, distribution: PoseDistribution, poses: Mapping[int, Pose]) -> Lost:
+    """The state without a pose hint that the search refuted, or without keyframes that are on unmapped ground.
+
+    They would hide that later ones are on known ground. A false alarm needs them.
+    """
+    if len(poses) < _REFUTING_KEYFRAMES or float(distribution.probabilities.sum()) >= 1.0 - _REFUTING_PROBABILITY:
+        return lost
+    if lost.pose_hint is not None:
+        return replace(lost, pose_hint=None)
+    return lost if lost.false_alarm is not None else replace(lost, unknown=max(poses))
 
 
 def _split_at_candidate(
@@ -356,7 +412,7 @@ def _is_same_place(hybrid_map: HybridMap, one: PoseInArea, other: PoseInArea) ->
     return bool(is_near and abs(difference[2]) <= _SAME_ANGLE)
 
 
-def _hint_of_first(lost: Lost, keyframes: dict[int, Pose]) -> PoseHint | None:
+def _hint_of_first(lost: Lost, keyframes: Mapping[int, Pose]) -> PoseHint | None:
     """The pose hint for the first of keyframes, {keyframe: ``area_T_base``}, from that for one of them."""
     hint = lost.pose_hint
     if hint is None or hint.keyframe not in keyframes:
@@ -372,70 +428,3 @@ def _poses_since(parent: Parent, keyframe: int) -> dict[int, Pose]:
     for area, pose in parent.local_area_poses().items():
         poses |= {k: se2.compose(pose, in_area) for k, in_area in parent.hybrid_map.keyframes(area).items()}
     return {k: poses[k] for k in sorted(poses)[-_MAX_KEYFRAMES:] if k >= keyframe}
-
-
-def spawn_kidnapped_hypothesis(branching: Branching, parent: Parent) -> Branches | None:
-    """The children "not kidnapped" and "kidnapped", or None where a kidnapping is too improbable."""
-    log_odds, since = parent.state.kidnapping_test(branching.options.kidnapping_prior)
-    keyframes = _keyframes_since(parent, since)
-    if (
-        log_odds < math.log(branching.options.kidnapping_odds)
-        or parent.probability < _MIN_KIDNAPPED_PROBABILITY
-        or len(keyframes) < _MIN_KIDNAPPED_KEYFRAMES
-    ):
-        return None
-    kidnapped = _kidnapped_child(branching, parent, keyframes, log_odds)
-    return Branches([parent.unchanged_child(replace(parent.state, kidnapping_evidence={})), kidnapped], True)
-
-
-def decide_without_mapping(branching: Branching, parent: Parent, event: int) -> Child:
-    """The only child without mapping: lost if a kidnapping is more probable than not, else unchanged.
-
-    No keyframe is stored that could tell which later. Moved furniture contradicts the map as a wrong pose does. But
-    then the other surfaces match at the tracked pose, and in no other place of the map.
-
-    :param event: the newest; metric SLAM resets its filters at the next one.
-    """
-    log_odds, since = parent.state.kidnapping_test(branching.options.kidnapping_prior)
-    state = parent.state
-    if log_odds > 0.0:
-        if not _confirms_tracked_pose(branching, parent, since):
-            alarm = FalseAlarm(state.unstored_poses[event], 1.0 / (1.0 + math.exp(log_odds)))
-            state = replace(state, localization=Lost(event + 1, false_alarm=alarm))
-        state = replace(state, kidnapping_evidence={}, unstored_poses={})
-    return parent.unchanged_child(state)
-
-
-def _confirms_tracked_pose(branching: Branching, parent: Parent, since: int) -> bool:
-    """Whether the scans since an event, which the map does not hold, match it at the tracked pose."""
-    unstored = [pose for event, pose in sorted(parent.state.unstored_poses.items()) if event >= since]
-    frames = shortest_path_beliefs(parent.hybrid_map, parent.area, targets={pose.area for pose in unstored})
-    tracked = {p.keyframe: se2.compose(frames[p.area].mean, p.pose) for p in unstored if p.area in frames}
-    if not tracked:
-        return False
-    first = min(tracked)
-    poses = {keyframe: se2.between(tracked[first], pose) for keyframe, pose in tracked.items()}
-    distribution = branching.localize_globally(parent, poses, first)
-    tracked_pose = PoseInArea(parent.area, first, tracked[first])
-    return prefers_tracked_pose(parent.hybrid_map, distribution, tracked_pose, poses, branching.options)
-
-
-def _keyframes_since(parent: Parent, event: int) -> list[int]:
-    """The keyframes of the robot's area since an event, without the first if the area would be left empty."""
-    keyframes = sorted(parent.hybrid_map.keyframes(parent.area))
-    newer = [k for k in keyframes if k >= event]
-    return newer if min(keyframes, default=0) < event else newer[1:]
-
-
-def _kidnapped_child(branching: Branching, parent: Parent, keyframes: Sequence[int], log_odds: float) -> Child:
-    """The child that was kidnapped before the first of some keyframes of its area, which begin a new area."""
-    query = branching.query(parent, keyframes)
-    distribution = branching.localize_globally(parent, query.poses, keyframes[0])
-    distribution = distribution.with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
-    tracked_pose = PoseInArea(parent.area, keyframes[0], query.belief.mean)
-    evidence = log_bayes_factor(parent.hybrid_map, distribution, tracked_pose, query.poses)
-    origin, arc = PoseGaussian.from_pose(np.zeros(3)), uninformative_belief(query.belief.mean)
-    child = branching.enter_area(parent, query, branching.new_area(parent, query), origin, arc, log_odds + evidence)
-    candidate = decisive_candidate(distribution, query.poses, branching.options)
-    lost = Lost(keyframes[0], candidate=candidate, tracked_pose=tracked_pose, counted_evidence=evidence)
-    return replace(child, state=replace(child.state, kidnapping_evidence={}, localization=lost))

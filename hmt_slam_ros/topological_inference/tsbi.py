@@ -51,11 +51,12 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import (
     merge_equivalent,
     normalize_and_reduce,
 )
+from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
 from hmt_slam_ros.topological_inference.relocalization import (
     accept_relocalization,
     begin_relocalization,
-    decide_without_mapping,
-    spawn_kidnapped_hypothesis,
+    is_search_due,
+    is_searching,
     update_relocalization,
 )
 
@@ -320,10 +321,11 @@ class Tsbi:
         if state.unlinked_overlap is not None and state.unlinked_overlap[1] >= _OVERLAP_PERSISTENCE:
             return self._branching.link(parent, state.unlinked_overlap[0], keyframe.scan, estimate.pose)
         unmatched = len(state.unmatched_keyframes)
-        if lost is not None and unmatched >= (self._options.recheck_keyframes if lost.pose_hint is None else 1):
+        is_recheck_due = unmatched >= self._options.recheck_keyframes
+        if is_search_due(parent, self._options) or (is_searching(parent) and not is_recheck_due):
             branches = update_relocalization(self._branching, parent)
             return branches if keyframe.mapping else accept_relocalization(branches)
-        if unmatched >= self._options.recheck_keyframes:
+        if is_recheck_due:
             return self._branching.recheck(parent)
         if state.pending_candidates and unmatched == _RETRY_KEYFRAMES:
             return self._branching.recheck(parent, state.pending_candidates)

@@ -1,0 +1,106 @@
+"""Kidnapped hypotheses: odometry can fail (slip, lost readings, a kidnapped robot), and scans contradict the submap.
+
+A CUSUM test gives the log-odds (``HypothesisState.kidnapping_test``). If they suffice, a kidnapped child is spawned,
+whose keyframes since the kidnapping begin a new area. It is lost from then on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs, uninformative_belief
+from hmt_slam_ros.topological_inference.branching import Branches, Branching, Child, Parent
+from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, Lost, PoseInArea
+from hmt_slam_ros.topological_inference.relocalization import (
+    KIDNAPPED_UNMAPPED_PRIOR,
+    decisive_candidate,
+    log_bayes_factor,
+    prefers_tracked_pose,
+)
+
+_MIN_KIDNAPPED_PROBABILITY = 0.05
+"""Smallest probability of a hypothesis that spawns a kidnapped child."""
+
+_MIN_KIDNAPPED_KEYFRAMES = 3
+"""Fewest keyframes since the kidnapping of a kidnapped child (docs/decisions/0026-kidnapping-detection.md)."""
+
+
+def spawn_kidnapped_hypothesis(branching: Branching, parent: Parent) -> Branches | None:
+    """The children "not kidnapped" and "kidnapped", or None where a kidnapping is too improbable."""
+    log_odds, since = parent.state.kidnapping_test(branching.options.kidnapping_prior)
+    keyframes = _keyframes_since(parent, since)
+    if (
+        log_odds < math.log(branching.options.kidnapping_odds)
+        or parent.probability < _MIN_KIDNAPPED_PROBABILITY
+        or len(keyframes) < _MIN_KIDNAPPED_KEYFRAMES
+    ):
+        return None
+    kidnapped = _kidnapped_child(branching, parent, keyframes, log_odds)
+    return Branches([parent.unchanged_child(replace(parent.state, kidnapping_evidence={})), kidnapped], True)
+
+
+def decide_without_mapping(branching: Branching, parent: Parent, event: int) -> Child:
+    """The only child without mapping: lost if a kidnapping is more probable than not, else unchanged.
+
+    No keyframe is stored that could tell which later. Moved furniture contradicts the map as a wrong pose does. But
+    then the other surfaces match at the tracked pose, and in no other place of the map.
+
+    :param event: the newest; metric SLAM resets its filters at the next one.
+    """
+    log_odds, since = parent.state.kidnapping_test(branching.options.kidnapping_prior)
+    state = parent.state
+    if log_odds > 0.0:
+        if not _confirms_tracked_pose(branching, parent, since):
+            alarm = FalseAlarm(state.unstored_poses[event], 1.0 / (1.0 + math.exp(log_odds)))
+            state = replace(state, localization=Lost(event + 1, false_alarm=alarm))
+        state = replace(state, kidnapping_evidence={}, unstored_poses={})
+    return parent.unchanged_child(state)
+
+
+def _confirms_tracked_pose(branching: Branching, parent: Parent, since: int) -> bool:
+    """Whether the scans since an event, which the map does not hold, match it at the tracked pose."""
+    unstored = [pose for event, pose in sorted(parent.state.unstored_poses.items()) if event >= since]
+    frames = shortest_path_beliefs(parent.hybrid_map, parent.area, targets={pose.area for pose in unstored})
+    tracked = {p.keyframe: se2.compose(frames[p.area].mean, p.pose) for p in unstored if p.area in frames}
+    if not tracked:
+        return False
+    first = min(tracked)
+    poses = {keyframe: se2.between(tracked[first], pose) for keyframe, pose in tracked.items()}
+    search = branching.search.begin_global_search(parent.hybrid_map, poses, first)
+    search = branching.search.continue_global_search(parent.hybrid_map, search, parent.area)
+    distribution = branching.localize_globally(parent, search)
+    tracked_pose = PoseInArea(parent.area, first, tracked[first])
+    return prefers_tracked_pose(parent.hybrid_map, distribution, tracked_pose, poses, branching.options)
+
+
+def _keyframes_since(parent: Parent, event: int) -> list[int]:
+    """The keyframes of the robot's area since an event, without the first if the area would be left empty."""
+    keyframes = sorted(parent.hybrid_map.keyframes(parent.area))
+    newer = [k for k in keyframes if k >= event]
+    return newer if min(keyframes, default=0) < event else newer[1:]
+
+
+def _kidnapped_child(branching: Branching, parent: Parent, keyframes: Sequence[int], log_odds: float) -> Child:
+    """The child that was kidnapped before the first of some keyframes of its area, which begin a new area."""
+    query = branching.query(parent, keyframes)
+    search = branching.search.begin_global_search(parent.hybrid_map, query.poses, keyframes[0])
+    search = branching.search.continue_global_search(parent.hybrid_map, search, parent.area)
+    distribution = branching.localize_globally(parent, search).with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
+    tracked_pose = PoseInArea(parent.area, keyframes[0], query.belief.mean)
+    evidence = log_bayes_factor(parent.hybrid_map, distribution, tracked_pose, query.poses)
+    origin, arc = PoseGaussian.from_pose(np.zeros(3)), uninformative_belief(query.belief.mean)
+    child = branching.enter_area(parent, query, branching.new_area(parent, query), origin, arc, log_odds + evidence)
+    lost = Lost(keyframes[0], tracked_pose=tracked_pose, counted_evidence=evidence)
+    if branching.search.is_conclusive(parent.hybrid_map, search, parent.clutter):
+        candidate = decisive_candidate(distribution, query.poses, branching.options)
+        fitting_areas = frozenset() if candidate is None else search.fitting_areas
+        lost = replace(lost, candidate=candidate, fitting_areas=fitting_areas, searched=max(query.poses))
+    else:
+        lost = replace(lost, search=search)
+    return replace(child, state=replace(child.state, kidnapping_evidence={}, localization=lost))
