@@ -1,5 +1,6 @@
 """A robot that starts somewhere in a map, or is kidnapped, maps around itself, until it is recognized where it is."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -16,9 +17,12 @@ from hmt_slam_ros.messages.messages import PoseReset
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.simulation.scenario import START
+from hmt_slam_ros.topological_inference import global_localization
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
+from hmt_slam_ros.topological_inference.tsbi import TsbiState
 
 WORLD = "sim:office,seed=3,size=0.7"
 CARRIED = f"{WORLD},carried=0.6,to=0.75,turned=120"
@@ -187,3 +191,31 @@ def test_one_that_is_kidnapped_while_it_stores_nothing_notices_and_is_recognized
 def test_an_arc_that_has_no_information_is_distinguished_from_the_least_certain_one_between_areas():
     assert is_uninformative(uninformative_belief(np.array([3.0, 4.0, 1.0])))
     assert not is_uninformative(PoseGaussian(np.zeros(3), np.diag([100.0, 100.0, 1.0]) ** 2))
+
+
+def test_a_search_that_is_saved_amid_goes_on_as_it_would_have(office, monkeypatch, tmp_path):
+    """In a building that it does not know, with one small region at each event, so that it takes several."""
+    monkeypatch.setattr(global_localization, "_EVENT_WORK", 1)
+    records = iter(open_log("sim:grid,seed=4,size=0.7").records())
+    configuration = replace(Configuration(), tsbi=replace(Configuration().tsbi, local_reach=1.0))
+    run = LockStepRun(configuration, state=office.state)
+    run.lock_step.feed(PoseReset())
+    for record in records:
+        run.process_record(record)
+        (state,) = run.state.processes["tsbi"].hypothesis_states.values()
+        if state.is_lost and state.localization.search is not None:
+            break
+    assert state.localization.search.unexamined
+    writer = FolderWriter(tmp_path)
+    writer.write("tsbi", run.state.processes["tsbi"])
+    writer.finish("state", 1)
+    saved = FolderReader(tmp_path, "state", 1).read("tsbi", TsbiState)
+    before = replace(run.state, processes={**run.state.processes, "tsbi": saved})
+    other = LockStepRun(configuration, state=before)
+    for record in itertools.islice(records, 80):
+        run.process_record(record)
+        other.process_record(record)
+    one, two = (each.recorder.hypotheses[max(each.recorder.hypotheses)].hypotheses for each in (run, other))
+    assert [(h.id, h.probability, h.area, h.lost) for h in one] == [(h.id, h.probability, h.area, h.lost) for h in two]
+    (own,), (again,) = (each.state.processes["tsbi"].hypothesis_states.values() for each in (run, other))
+    assert own.localization.searched == again.localization.searched == max(state.localization.search.poses)
