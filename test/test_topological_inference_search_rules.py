@@ -75,9 +75,7 @@ def test_matches_count_in_the_areas_that_are_searched_alone(monkeypatch):
     searched, matched = [], []
     cells = SearchCells(np.zeros((1, 3), np.int64), np.ones(1), np.zeros(1), 7)
     monkeypatch.setattr(module, "find_cells", lambda *given: searched.append(given) or cells)
-    monkeypatch.setattr(
-        module, "match_areas", lambda *given: matched.append(given) or SimpleNamespace(modes=modes, work=0)
-    )
+    monkeypatch.setattr(module, "match_areas", lambda *given: matched.append(given) or SimpleNamespace(modes=modes))
     places = {2.0: 2, 3.0: 3, -1.0: None, 2.5: 2}
     monkeypatch.setattr(module, "containing_area", lambda _place, poses, _radius: places[float(poses[0, 0])])
     grid = module.AreaGrid(

@@ -95,11 +95,9 @@ class AreaMatch:
 
     :ivar log_evidence: log of the integral of p(x) (p(z | x, candidate) / p(z | unknown))^temper over the gate, nats;
         -inf where all of it is negligible.
-    :ivar work: number of samples that the search looked up.
     """
 
     log_evidence: float = -math.inf
-    work: int = 0
     _find_modes: Callable[[], tuple[MatchMode, ...]] = tuple
 
     # On demand: for some comparisons the evidence is enough.
@@ -126,10 +124,10 @@ def match_areas(
         points, m.
     :param cells: those of :func:`find_cells` with the same arguments, if they are known.
     """
-    result, work = _search(query, candidate, prior, settings, bounds, cells)
+    result = _search(query, candidate, prior, settings, bounds, cells)
     if result is None:
-        return AreaMatch(work=work)
-    return AreaMatch(float(np.logaddexp.reduce(result.masses)), work, lambda: tuple(_modes(result)))
+        return AreaMatch()
+    return AreaMatch(float(np.logaddexp.reduce(result.masses)), lambda: tuple(_modes(result)))
 
 
 def find_cells(
@@ -174,7 +172,7 @@ def best_pose(
 
     It costs a fraction of the mode with its covariance.
     """
-    result, _ = _search(query, candidate, prior, settings)
+    result = _search(query, candidate, prior, settings)
     if result is None:
         return None
     labels, totals = _cluster(result)
@@ -190,19 +188,19 @@ def _search(
     settings: MatchSettings,
     bounds: Float64 | None = None,
     cells: SearchCells | None = None,
-) -> tuple[_SearchResult | None, int]:
-    """The cells of a search, None without any, and the number of samples that it looked up."""
+) -> _SearchResult | None:
+    """The cells of a search, None without any."""
     if not query.points.size or not candidate.points.size:
-        return None, 0
+        return None
     if cells is None:
         cells = find_cells(query, _coarse_grid(candidate), candidate.points, prior, settings, bounds)
     if not cells.score.size:
-        return None, cells.work
+        return None
     centered, surface = _center(query, candidate.cell, prior, settings, bounds), _fine_grid(candidate)
     samples, window = centered.query.points, centered.window
     problem = _MatchProblem(surface, samples, window, centered.prior, settings, centered.to_middle)
     masses, poses = match_modes.integrate_cells(surface, samples, window, cells, settings.temper)
-    return _SearchResult(problem, cells, masses + centered.log_cell, poses), cells.work
+    return _SearchResult(problem, cells, masses + centered.log_cell, poses)
 
 
 def _center(
