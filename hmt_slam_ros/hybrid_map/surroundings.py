@@ -43,10 +43,10 @@ _MIN_FREE_FRACTION = 0.5
 _MAX_NEIGHBORS = 64
 """Most areas around an area; bounds the work where tight arcs join hundreds."""
 
-_CACHE_BYTES = 4 << 23
-"""Size of the grids that are cached, bytes: those of about ten places of a large building."""
+_CACHE_BYTES = 4 << 25
+"""Size of the grids that are cached, bytes: those of about thirty places, with which a comparison is made at most."""
 
-_COARSE_CACHE_BYTES = 3 * _CACHE_BYTES
+_COARSE_CACHE_BYTES = 3 << 25
 """Size of the coarse grids that global localization needs again and again, bytes: those of about forty regions."""
 
 

@@ -122,6 +122,7 @@ class ReverseCheck(NamedTuple):
     :ivar grid: the query's.
     :ivar points: shape (m, 2), the candidate's surface points, m, candidate frame.
     :ivar rotated_points: shape (turns, m, 2), the same in the query's frame without a shift, cells of the grid.
+    :ivar is_rotated: shape (turns,), at which turns they are computed: few turns have a block that is tested.
     :ivar negative: for cells of the grid and ``reach`` beyond, whether a cell within ``reach`` has a log-ratio below 0.
     :ivar reach: largest distance between a point at a shift of a block and at its middle, plus one, cells.
     """
@@ -129,6 +130,7 @@ class ReverseCheck(NamedTuple):
     grid: LogRatioGrid
     points: Float64
     rotated_points: Float32
+    is_rotated: Bool
     negative: Bool
     reach: int
 
@@ -136,21 +138,25 @@ class ReverseCheck(NamedTuple):
 def make_reverse_check(window: SearchWindow, grid: LogRatioGrid, points: Float64) -> ReverseCheck:
     """The reverse check of a window; the arguments are those of :func:`search_cells`."""
     reach = math.ceil(math.sqrt(0.5) * (BLOCK - 1) * window.cell / grid.cell) + 1
-    return ReverseCheck(
-        grid, points, _rotate_points(window, grid, points), _near_negative(grid.log_ratio, reach), reach
-    )
+    turns = window.turns.size
+    rotated = np.empty((turns, len(points), 2), np.float32)
+    negative = _near_negative(grid.log_ratio, reach)
+    return ReverseCheck(grid, points, rotated, np.zeros(turns, np.bool_), negative, reach)
 
 
 @njit(cache=True)
-def _rotate_points(window: SearchWindow, grid: LogRatioGrid, points: Float64) -> Float32:
-    rotated = np.empty((window.turns.size, points.shape[0], 2), np.float32)
-    for k in range(window.turns.size):
-        angle = window.mean[2] + window.turns[k]
-        cos, sin = np.cos(angle) / grid.cell, np.sin(angle) / grid.cell
-        for n in range(points.shape[0]):
-            x, y = rotate_back(cos, sin, points[n, 0] - window.mean[0], points[n, 1] - window.mean[1])
-            rotated[k, n, 0] = x - grid.origin[0] / grid.cell
-            rotated[k, n, 1] = y - grid.origin[1] / grid.cell
+def _rotate_points(check: ReverseCheck, window: SearchWindow, k: int) -> Float32:
+    """The points at turn ``k``, shape (m, 2), computed at the first call."""
+    rotated, grid, points = check.rotated_points[k], check.grid, check.points
+    if check.is_rotated[k]:
+        return rotated
+    angle = window.mean[2] + window.turns[k]
+    cos, sin = np.cos(angle) / grid.cell, np.sin(angle) / grid.cell
+    for n in range(points.shape[0]):
+        x, y = rotate_back(cos, sin, points[n, 0] - window.mean[0], points[n, 1] - window.mean[1])
+        rotated[n, 0] = x - grid.origin[0] / grid.cell
+        rotated[n, 1] = y - grid.origin[1] / grid.cell
+    check.is_rotated[k] = True
     return rotated
 
 
@@ -173,7 +179,7 @@ def _near_negative(log_ratio: Float32, reach: int) -> Bool:
 @njit(cache=True)
 def gather_block_points(check: ReverseCheck, window: SearchWindow, node: tuple[int, int, int], points: Float64) -> int:
     """Write to ``points`` those that may contradict in the block that begins at ``node``; returns their number."""
-    negative, rotated = check.negative, check.rotated_points[node[0]]
+    negative, rotated = check.negative, _rotate_points(check, window, node[0])
     angle, ratio = window.mean[2] + window.turns[node[0]], window.cell / check.grid.cell
     cos, sin = ratio * np.cos(angle), ratio * np.sin(angle)
     x, y = node[1] + 0.5 * (BLOCK - 1), node[2] + 0.5 * (BLOCK - 1)
