@@ -25,12 +25,42 @@ from hmt_slam_ros.registration.search_bounds import (
     LogRatioGrid,
     add_block,
     build_pyramid,
+    count_known,
+    lattice_bounds,
     make_search_window,
     prior_bound,
     quarter_bounds,
     sample_cells,
-    square_bound,
+    sort_by_phase,
 )
+
+
+def values_at(level, cells, i, j):
+    """The elements of a level at cells (n, 2) shifted by (i, j), 0 beyond it, shape (n,)."""
+    x, y = (np.asarray(cells) + np.array([i, j])).T
+    inside = (x >= 0) & (x < level.shape[1]) & (y >= 0) & (y < level.shape[0])
+    return np.where(inside, level[np.where(inside, y, 0), np.where(inside, x, 0)], 0).astype(int)
+
+
+def square_bound(level, margin, cells, i, j):
+    """Bound of the sum over the samples in the square that begins at (i, j), steps."""
+    return values_at(level, cells, i + margin, j + margin).sum()
+
+
+@pytest.mark.parametrize(("height", "shape"), [(2, (40, 27)), (3, (41, 70)), (5, (30, 33))])
+def test_the_bounds_of_a_lattice_are_those_of_its_squares(height, shape):
+    rng, side = np.random.default_rng(height), 2**height
+    level = rng.integers(-128, 65, shape).astype(np.int8)
+    level[rng.random(shape) < 0.5] = 0
+    cells = rng.integers(-90, 90, (300, 2)).astype(np.int32)
+    for (across, along), (i, j) in itertools.product(((1, 1), (5, 2), (2, 6)), ((0, 0), (-37, 12), (64, -200))):
+        phased = sort_by_phase(level, height, across)
+        bounds = lattice_bounds(phased, cells, i, j, along)
+        counts, largest = count_known(phased, cells, i, j, along)
+        for a, b in itertools.product(range(across), range(along)):
+            values = values_at(level, cells, i + a * side, j + b * side)
+            assert bounds[b, a] == values.sum()
+            assert (counts[b, a], largest[b, a]) == ((values != 0).sum(), values.max(initial=0))
 
 
 def test_a_constraint_admits_the_cells_within_the_radius_of_a_position_anywhere_in_them():

@@ -24,10 +24,12 @@ from hmt_slam_ros.registration.search_bounds import (
     SearchWindow,
     add_block,
     build_pyramid,
+    count_known,
+    lattice_bounds,
     prior_bound,
     quarter_bounds,
     sample_cells,
-    square_bound,
+    sort_by_phase,
 )
 
 _OWN, _AROUND = 1.0, 0.5
@@ -325,21 +327,32 @@ def _coarse_nodes(task: _SearchProblem, height: int) -> tuple[Int64, Float64]:
     """The coarsest nodes (k, i, j) of all turns, and their bounds."""
     window, side = task.window, 2**height
     across, along = (window.last - window.first) // side + 1
+    level = sort_by_phase(task.bounds.levels[height], height, across)
+    allowed = sort_by_phase(task.constraint.pyramid.levels[height], height, across)
+    x, y = window.first + task.bounds.margin
     nodes = np.empty((window.turns.size * across * along, 3), dtype=np.int64)
     bounds = np.empty(nodes.shape[0])
-    n = 0
+    count = 0
     for k in range(window.turns.size):
-        for i in range(window.first[0], window.last[0] + 1, side):
-            for j in range(window.first[1], window.last[1] + 1, side):
-                if not is_admissible(task.constraint, height, k, i, j):
+        before = count
+        keyframes = task.constraint.keyframes[k]
+        near, largest = count_known(allowed, keyframes, x, y, along)
+        for a in range(across):
+            for b in range(along):
+                if keyframes.shape[0] > 0 and (2 * near[b, a] < keyframes.shape[0] or largest[b, a] <= _AROUND_STEPS):
                     continue
+                i, j = window.first[0] + a * side, window.first[1] + b * side
                 prior = prior_bound(window, k, i, j, side)
                 if prior > -np.inf:
-                    steps = square_bound(task.bounds.levels[height], task.bounds.margin, task.cells[k], i, j)
-                    nodes[n, 0], nodes[n, 1], nodes[n, 2] = k, i, j
-                    bounds[n] = task.temper * task.bounds.step * steps + prior
-                    n += 1
-    return nodes[:n], bounds[:n]
+                    nodes[count, 0], nodes[count, 1], nodes[count, 2] = k, i, j
+                    bounds[count] = prior
+                    count += 1
+        if count > before:
+            steps = lattice_bounds(level, task.cells[k], x, y, along)
+            for n in range(before, count):
+                a, b = (nodes[n, 1] - window.first[0]) // side, (nodes[n, 2] - window.first[1]) // side
+                bounds[n] = task.temper * task.bounds.step * steps[b, a] + bounds[n]
+    return nodes[:count], bounds[:count]
 
 
 @njit(cache=True)

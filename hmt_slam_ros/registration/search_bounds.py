@@ -168,29 +168,102 @@ def sample_cells(window: SearchWindow, surface: LogRatioGrid, samples: Float64) 
     return cells
 
 
-# Below, an unsigned negative index is a large one: a single comparison tests whether it is in the grid.
+class PhasedLevel(NamedTuple):
+    """A level of a pyramid, sorted by position within the squares of a lattice.
+
+    A sample reads all squares of the lattice at the same position within them, so these are neighbors here.
+
+    :ivar rows: shape (side, side, n), int8, steps: for each position [y, x] within a square the elements at it, row by
+        row of the lattice; before every row and after the last one there are ``across`` elements of 0.
+    :ivar shape: number of the lattice's rows and columns.
+    :ivar height: the squares have an edge of ``2**height``.
+    :ivar across: largest number of squares that are read along x.
+    """
+
+    rows: Int8
+    shape: tuple[int, int]
+    height: int
+    across: int
 
 
 @njit(cache=True)
-def square_bound(level: Int8, margin: int, cells: Int32, i: int, j: int) -> int:
-    """Bound of the sum over the samples (n, 2) in the square of shifts that begins at (i, j), steps.
+def sort_by_phase(level: Int8, height: int, across: int) -> PhasedLevel:
+    """The level for squares of edge ``2**height``, of which ``across`` at most are read along x."""
+    side = 1 << height
+    rows, columns = (level.shape[0] + side - 1) >> height, (level.shape[1] + side - 1) >> height
+    width = columns + across
+    phases = np.zeros((side, side, across + rows * width), np.int8)
+    for y in range(level.shape[0]):
+        first = across + (y >> height) * width
+        for x in range(side):
+            row = phases[y & (side - 1), x]
+            for c in range((level.shape[1] - x + side - 1) >> height):
+                row[first + c] = level[y, (c << height) + x]
+    return PhasedLevel(phases, (rows, columns), height, across)
+
+
+@njit(cache=True)
+def lattice_bounds(level: PhasedLevel, cells: Int32, i: int, j: int, along: int) -> Int32:
+    """Bounds of the sum over the samples (n, 2) in the squares of a lattice, steps, shape (along, at least across).
+
+    The compiler vectorizes the additions: all squares take less than a tenth of their time one by one.
 
     :param level: of the pyramid, for squares of this size.
+    :param i: shift along x of the lattice's first square, from the corner of the level, cells; ``j``, along y.
+    :param along: number of squares along y.
     """
-    rows, columns = np.uint32(level.shape[0]), np.uint32(level.shape[1])
-    total = 0
+    rows, columns = level.shape
+    across, width, last = level.across, columns + level.across, (1 << level.height) - 1
+    totals = np.zeros(along * width, np.int32)
     for n in range(cells.shape[0]):
-        x, y = np.uint32(cells[n, 0] + i + margin), np.uint32(cells[n, 1] + j + margin)
-        if x < columns and y < rows:
-            total += level[y, x]
-    return total
+        x, y = cells[n, 0] + i, cells[n, 1] + j
+        column, row = x >> level.height, y >> level.height
+        if -across < column < columns and -along < row < rows:
+            low, high = max(0, -row), min(along, rows - row)
+            count = (high - low - 1) * width + across
+            first = across + (row + low) * width + column
+            part, sums = level.rows[y & last, x & last, first : first + count], totals[low * width :]
+            for c in range(count):
+                sums[c] += part[c]
+    return totals.reshape(along, width)
+
+
+@njit(cache=True)
+def count_known(level: PhasedLevel, cells: Int32, i: int, j: int, along: int) -> tuple[Int32, Int8]:
+    """How many of the cells (n, 2) are not 0 in the squares of a lattice, and the largest of them, steps.
+
+    The arguments and the shapes are those of :func:`lattice_bounds`.
+    """
+    rows, columns = level.shape
+    across, width, last = level.across, columns + level.across, (1 << level.height) - 1
+    counts, largest = np.zeros(along * width, np.int32), np.zeros(along * width, np.int8)
+    for n in range(cells.shape[0]):
+        x, y = cells[n, 0] + i, cells[n, 1] + j
+        column, row = x >> level.height, y >> level.height
+        if -across < column < columns and -along < row < rows:
+            low, high = max(0, -row), min(along, rows - row)
+            count = (high - low - 1) * width + across
+            first = across + (row + low) * width + column
+            part = level.rows[y & last, x & last, first : first + count]
+            known, values = counts[low * width :], largest[low * width :]
+            for c in range(count):
+                known[c] += part[c] != 0
+                values[c] = max(values[c], part[c])
+    return counts.reshape(along, width), largest.reshape(along, width)
+
+
+# Below, an unsigned negative index is a large one: a single comparison tests whether it is in the grid.
 
 
 @njit(cache=True)
 def quarter_bounds(
     level: Int8, margin: int, cells: Int32, i: int, j: int, side: int
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """:func:`square_bound` of the squares of edge ``side`` that begin at (i, j), right of it, and below both."""
+    """Bounds of the sum over the samples (n, 2) in the square of shifts that begins at (i, j), and in those beside it.
+
+    :param level: of the pyramid, for squares of edge ``side``.
+    :returns: bounds of that square and the one right of it, and of the two below, steps.
+    """
     rows, columns = np.uint32(level.shape[0] - side), np.uint32(level.shape[1] - side)
     beside = np.uint32(side)
     first, right, below, both = 0, 0, 0, 0
