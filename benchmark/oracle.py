@@ -27,9 +27,10 @@ from hmt_slam_ros.hybrid_map.surroundings import areas_around
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import open_simulated
+from hmt_slam_ros.topological_inference.area_comparison import ComparisonKind, OngoingComparison
 from hmt_slam_ros.topological_inference.branching import Branching, Child, Parent
-from hmt_slam_ros.topological_inference.candidate_gating import AreaCandidate, Query, Transition
-from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch
+from hmt_slam_ros.topological_inference.candidate_gating import AreaCandidate, Query
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
@@ -211,7 +212,7 @@ def _configuration(changes: Sequence[str]) -> Configuration:
 
 def run_tsbi(drive: Sequence[KeyframeStop], configuration: Configuration, noise: float) -> list[dict[Visits, float]]:
     """TSBI's PMF after every cut, without unexamined and dropped probability."""
-    script = Script(Tsbi(configuration), noise=noise)
+    script = Script(Tsbi(configuration, _UnboundedBranching), noise=noise)
     paths: dict[int, tuple[Visits, dict[int, int]]] = {FIRST_HYPOTHESIS: ((0,), {0: 0})}
     pmfs = []
     for stop in drive:
@@ -261,14 +262,32 @@ def _table_row(regime: str, world: str, drives: Sequence[ComparedDrive]) -> list
     return [regime, world, str(len(drives)), str(cuts), str(most), *means]
 
 
-class _EverywhereSearch(ClosureSearch):
+class _UnboundedSearch(ClosureSearch):
+    """A closure search that compares at one event, however much work that is: no area abstraction repeats a cut."""
+
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether the work of the event is done."""
+        return False
+
+
+class _UnboundedBranching(Branching):
+    """A branching with that search."""
+
+    def __init__(self, configuration: Configuration, replica: Replica) -> None:
+        super().__init__(configuration, replica)
+        self.search = _UnboundedSearch(configuration, replica.scans)
+
+
+class _EverywhereSearch(_UnboundedSearch):
     """A closure search in all areas, with the same likelihoods."""
 
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
         super().__init__(configuration, scans)
         self._settings = replace(self._settings, gate=chi_square_gate(_EVERYWHERE), margin=25.0, max_modes=1000)
+        self._options = replace(self._options, max_modes=1000)
 
-    def compare(
+    def begin_comparison(
         self,
         hybrid_map: HybridMap,
         area: int,
@@ -276,44 +295,24 @@ class _EverywhereSearch(ClosureSearch):
         compare_drive: Mapping[int, Collection[int]],
         excluded: Collection[int],
         most: int,
+        kind: ComparisonKind = "recheck",
         only: Collection[int] = (),
-    ) -> AreaComparison:
+    ) -> OngoingComparison:
         """Compare as ``ClosureSearch`` does, with all areas."""
         del most, only
-        options = self._options
         unmatched = {
             known: {k: pose for k, pose in query.poses.items() if k not in compare_drive.get(known, ())}
             for known in hybrid_map.area_ids()
             if known not in excluded
         }
         beliefs = shortest_path_beliefs(hybrid_map, area)
-        candidates_by_prior = [known for known, own in unmatched.items() if 2 * len(own) >= len(query.poses)]
-        priors = {known: self.gating.prior(beliefs[known], query) for known in candidates_by_prior}
-        candidates = {known: AreaCandidate(prior, unmatched[known], 1.0) for known, prior in priors.items()}
-        places = {known: self._grid_cache.place(hybrid_map, known, excluded) for known in candidates}
-        entries = {known: self._entry_probability(place, candidates[known]) for known, place in places.items()}
-        shares = {known: found.probability for known, found in entries.items() if found.probability}
-        modes = {known: self._modes(places[known], candidates[known]) for known in shares}
-        total = sum(shares.values())
-        new = max(1.0 - total, options.new_probability) if total else 1.0
-        if shares:
-            elsewhere = self.gating.classify_areas(hybrid_map, area, query, excluded)[2]
-            self._sample_aliasing(query, [self._negative_sample(hybrid_map, other, excluded) for other in elsewhere])
-        fits = [
-            fit
-            for known, share in shares.items()
-            for fit in self._fits(
-                hybrid_map,
-                places[known],
-                candidates[known],
-                modes[known] or (),
-                entries[known],
-                (1.0 - new) * share / total,
-            )
-        ]
-        beside_areas = tuple(known for known, found in modes.items() if found is None)
-        examined = tuple(known for known in shares if known not in beside_areas)
-        return AreaComparison(Transition({}, new), tuple(fits), examined, beside_areas, 0.0)
+        candidates = {
+            known: AreaCandidate(self.gating.prior(beliefs[known], query), own, 1.0)
+            for known, own in unmatched.items()
+            if 2 * len(own) >= len(query.poses)
+        }
+        elsewhere = self.gating.classify_areas(hybrid_map, area, query, excluded)[2]
+        return OngoingComparison(query, frozenset(excluded), kind, candidates, {}, tuple(elsewhere))
 
 
 @dataclass(frozen=True, eq=False)

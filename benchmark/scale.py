@@ -203,7 +203,7 @@ class _TimedTsbi:
     def _branching(self, configuration: Configuration, replica: Replica) -> Branching:
         replica.maps[FIRST_HYPOTHESIS] = self._lattice.hybrid_map()
         replica.scans = LatticeScans()
-        return ObservedBranching(configuration, replica, self._count)
+        return ObservedBranching(configuration, replica, self._count, is_bounded=False)
 
     def _count(self, examination: Examination) -> None:
         self._compared += len(examination.found.examined_areas)

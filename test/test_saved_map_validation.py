@@ -45,7 +45,7 @@ for part in (*PARTS.values(), MapDocument, ChainState, ScanTable):
     records_of(part, RECORDS)
 
 
-FORM = (20, "cb3d481a2dd7cb7b")
+FORM = (20, "fd582ec09c465fd6")
 """Version of the format, and the digest of all fields and types: a change of one is a change of both."""
 
 

@@ -16,9 +16,11 @@ from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.topological_inference import branching as module
-from hmt_slam_ros.topological_inference.branching import Branching, Parent, apply_revision, merge_areas
+from hmt_slam_ros.topological_inference.area_comparison import AreaComparison, Fit, OngoingComparison
+from hmt_slam_ros.topological_inference.branching import Branching, Parent
 from hmt_slam_ros.topological_inference.candidate_gating import Transition
-from hmt_slam_ros.topological_inference.closure_search import AreaComparison, Fit, _split_heaviest
+from hmt_slam_ros.topological_inference.closure_search import _split_heaviest
+from hmt_slam_ros.topological_inference.hypothesis_changes import apply_revision, merge_areas
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
 
 CONFIGURATION = with_changes(
@@ -60,8 +62,27 @@ def make_parent(**changes):
 
 def make_branching(**search):
     branching = Branching(CONFIGURATION, Replica())
-    branching.search = SimpleNamespace(**search)
+    branching.search = SimpleNamespace(**{"begin_event": lambda: None, "tracked_area": lambda *_: None, **search})
     return branching
+
+
+class GivenComparison:
+    """A comparison whose result is given, after some events, and what was requested."""
+
+    def __init__(self, found, events=1):
+        self.found, self.remaining, self.requested = found, events, []
+
+    def begin_comparison(self, *given):
+        self.requested.append(given)
+        _, _, query, _, excluded, _, kind, _ = given
+        return OngoingComparison(query, frozenset(excluded), kind, {}, {}, ())
+
+    def continue_comparison(self, _hybrid_map, comparison):
+        self.remaining -= 1
+        return self.found if self.remaining == 0 else comparison
+
+    def branching(self):
+        return make_branching(begin_comparison=self.begin_comparison, continue_comparison=self.continue_comparison)
 
 
 def moved_covariance(entry, relative, relative_covariance):
@@ -127,9 +148,8 @@ def fit(area, log_weight, pose=(1.0, 0.2, 0.3)):
 def test_a_cut_branches_over_new_ground_and_every_fit_by_their_weights():
     fits = fit(2, -1.5), fit(6, -2.5, (0.3, -0.1, -1.0))
     comparison = AreaComparison(Transition({2: 0.4, 6: 0.2}, 0.4), fits, (2, 6), (0,), 0.05)
-    requested = []
-    search = {"tracked_area": lambda *_: None, "compare": lambda *given: requested.append(given) or comparison}
-    branching, parent = make_branching(**search), make_parent(local_area_poses={0: BACK, 77: ARC})
+    given = GivenComparison(comparison)
+    branching, parent = given.branching(), make_parent(local_area_poses={0: BACK, 77: ARC})
     found = branching.cut(parent, [12, 13, 14])
     new, *known = found.children
     assert found.closures_searched
@@ -146,8 +166,8 @@ def test_a_cut_branches_over_new_ground_and_every_fit_by_their_weights():
         expected = query.belief.compose(each.mode.measured.inverse())
         np.testing.assert_allclose(child.arcs[0].pose.mean, expected.mean)
         np.testing.assert_allclose(child.arcs[0].pose.covariance, expected.covariance)
-    hybrid_map, area, _, _, excluded, most, only = requested[0]
-    assert (hybrid_map, area, excluded, tuple(only)) == (parent.hybrid_map, 1, {0, 1}, ())
+    hybrid_map, area, _, _, excluded, most, kind, only = given.requested[0]
+    assert (hybrid_map, area, excluded, kind, tuple(only)) == (parent.hybrid_map, 1, {0, 1}, "cut", ())
     assert most == 6  # 20 comparisons by the probability
     assert branching.new_area(parent, query) == 7
     assert branching.new_area(parent, branching.query(parent, [13])) == 8
@@ -158,9 +178,9 @@ def test_a_cut_branches_over_new_ground_and_every_fit_by_their_weights():
 @pytest.mark.parametrize(("probability", "most"), [(1.0, 9), (0.44, 9), (0.31, 7), (0.001, module.MIN_EXAMINED_AREAS)])
 def test_more_areas_are_examined_the_more_probable_the_hypothesis_is(probability, most):
     requested = []
-    branching = make_branching(compare=lambda *given: requested.append(given[5]))
+    branching = make_branching(begin_comparison=lambda *given: requested.append(given[5]))
     parent = replace(make_parent(), probability=probability)
-    branching._compare_areas(parent, branching.query(parent, [12]), ())
+    branching._begin_comparison(parent, branching.query(parent, [12]), (), "cut")
     assert requested == [most]
 
 
@@ -174,9 +194,8 @@ def test_more_areas_are_examined_the_more_probable_the_hypothesis_is(probability
     ],
 )
 def test_a_recheck_leaves_keyframes_where_they_are_and_joins_the_areas(only, fits, log_stay, keyframes, unmatched):
-    comparison, requested = AreaComparison(Transition({6: 0.6}, 0.4), fits, (6,), (0,), 0.0), []
-    branching = make_branching(compare=lambda *given: requested.append(given) or comparison)
-    parent = make_parent()
+    given = GivenComparison(AreaComparison(Transition({6: 0.6}, 0.4), fits, (6,), (0,), 0.0))
+    branching, parent = given.branching(), make_parent()
     found = branching.recheck(parent, only)
     stay, *joined = found.children
     assert found.log_skipped_weight == -math.inf
@@ -184,8 +203,9 @@ def test_a_recheck_leaves_keyframes_where_they_are_and_joins_the_areas(only, fit
     assert (stay.area, stay.arcs, stay.moved_keyframes) == (1, (), ())
     assert (stay.state.unmatched_keyframes, stay.state.pending_candidates) == (unmatched, (0,))
     assert stay.state.matched_keyframes == {6: frozenset(keyframes)}
-    assert list(requested[0][2].poses) == keyframes
-    assert requested[0][4] == {0, 1, 2}
+    assert list(given.requested[0][2].poses) == keyframes
+    assert given.requested[0][4] == {0, 1, 2}
+    assert given.requested[0][6:] == ("retry" if only else "recheck", only)
     assert len(joined) == len(fits)
     for child in joined:
         assert (child.area, child.moved_keyframes, child.reload_local_map) == (1, (), True)
@@ -195,6 +215,86 @@ def test_a_recheck_leaves_keyframes_where_they_are_and_joins_the_areas(only, fit
         expected = branching.query(parent, keyframes).belief.compose(fits[0].mode.measured.inverse())
         np.testing.assert_allclose(arc.pose.mean, expected.mean)
         np.testing.assert_allclose(arc.pose.covariance, expected.covariance)
+
+
+def waiting(branches):
+    """The comparison of an only child to which nothing else happened."""
+    (child,) = branches.children
+    assert not branches.closures_searched
+    assert (child.area, child.log_weight, child.arcs, child.moved_keyframes) == (1, -0.7, (), ())
+    return child.state.comparison
+
+
+def test_a_recheck_ends_at_the_event_of_its_last_comparison_and_newer_keyframes_wait_for_the_next():
+    fits = fit(6, -2.0), fit(2, -1.0)
+    given = GivenComparison(AreaComparison(Transition({6: 0.3, 2: 0.3}, 0.4), fits, (6, 2), (), 0.1), 3)
+    branching, parent = given.branching(), make_parent()
+    comparison = waiting(branching.recheck(parent))
+    assert list(comparison.query.poses) == [12, 14]
+    assert waiting(branching.continue_comparison(parent, comparison)) is comparison
+    state = replace(parent.state, unmatched_keyframes=(12, 14, 15), comparison=comparison)
+    found = branching.continue_comparison(replace(parent, state=state), comparison)
+    # An arc joins area 2 to the robot's.
+    stay, joined = found.children
+    assert (stay.log_weight, joined.log_weight) == pytest.approx((-0.7 + math.log(0.4), -2.7))
+    assert joined.arcs[0].target == 6
+    assert found.log_skipped_weight == pytest.approx(math.log(0.1) - 0.7)
+    for child in (stay, joined):
+        assert (child.state.comparison, child.state.unmatched_keyframes) == (None, (15,))
+        assert child.state.matched_keyframes == {6: {12, 14}, 2: {12, 14}}
+    assert len(given.requested) == 1
+
+
+@pytest.mark.parametrize("newer", [(), (15,)])
+def test_keyframes_are_cut_at_the_event_of_their_last_comparison_together_with_newer_ones(newer):
+    given = GivenComparison(AreaComparison(Transition({6: 0.6}, 0.4), (fit(6, -2.0),), (6,), (), 0.0), 2)
+    branching, parent = given.branching(), make_parent()
+    comparison = waiting(branching.cut(parent, [12, 13, 14]))
+    for keyframe in newer:
+        parent.hybrid_map.set_keyframe(keyframe, 1, np.array([2.0, 0.5, 0.4]))
+    parent = replace(parent, state=replace(parent.state, comparison=comparison))
+    new, known = branching.cut(parent, [12, 13, 14, *newer]).children
+    assert [child.area for child in (new, known)] == [7, 6]
+    own, reference = parent.hybrid_map.keyframes(1), comparison.query.belief.mean
+    for moved in known.moved_keyframes:
+        expected = se2.compose(fit(6, 0.0).mode.pose.mean, se2.between(reference, own[moved.keyframe]))
+        np.testing.assert_allclose(moved.pose, expected)
+    for child in (new, known):
+        assert [moved.keyframe for moved in child.moved_keyframes] == [12, 13, 14, *newer]
+        assert child.state.comparison is None
+
+
+@pytest.mark.parametrize(("kind", "compared"), [("recheck", [12, 13]), ("cut", [11, 12])])
+def test_a_cut_waits_for_the_comparison_of_others(kind, compared):
+    given = GivenComparison(AreaComparison(Transition({}, 1.0), (), (6,), (), 0.0), 2)
+    branching, parent = given.branching(), make_parent()
+    ongoing = OngoingComparison(branching.query(parent, compared), frozenset({1}), kind, {}, {}, ())
+    parent = replace(parent, state=replace(parent.state, comparison=ongoing))
+    assert waiting(branching.cut(parent, [12, 13, 14])) is ongoing
+    (child,) = branching.cut(parent, [12, 13, 14]).children
+    assert (child.area, child.state.comparison, child.state.matched_keyframes) == (1, None, {6: set(compared)})
+    assert given.requested == []
+
+
+def test_where_arcs_are_wide_keyframes_begin_an_area_at_once_and_are_compared_there():
+    given = GivenComparison(AreaComparison(Transition({6: 0.6}, 0.4), (fit(6, -2.0),), (6,), (), 0.0), 2)
+    branching, parent = given.branching(), make_parent(local_area_poses={0: BACK})
+    wide = {**parent.state.covariances, 14: 100.0 * SPREAD}
+    parent = replace(parent, state=replace(parent.state, covariances=wide))
+    (child,) = branching.cut(parent, [14]).children
+    assert given.requested[0][4] == {1}
+    assert (child.area, child.log_weight) == (7, -0.7)
+    comparison = child.state.comparison
+    np.testing.assert_array_equal(comparison.query.belief.mean, np.zeros(3))
+    np.testing.assert_allclose(comparison.query.belief.covariance, child.state.covariances[14] + FLOOR)
+    parent.hybrid_map.remove_keyframe(14, 1)
+    parent.hybrid_map.set_keyframe(14, 7, np.zeros(3))
+    entered = replace(parent, area=7, state=child.state)
+    stay, joined = branching.continue_comparison(entered, comparison).children
+    assert (stay.area, joined.area) == (7, 7)
+    (arc,) = joined.arcs
+    assert (arc.source, arc.target) == (7, 6)
+    np.testing.assert_allclose(arc.pose.mean, se2.inverse(fit(6, 0.0).mode.measured.mean))
 
 
 def test_where_the_robot_is_tracked_into_an_area_the_submap_gives_the_pose():

@@ -11,7 +11,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import MAP_IN_MAP, MAPS_OUTLIER_RATE, Agreement
-from hmt_slam_ros.topological_inference.candidate_gating import AreaCandidate, EntryPrior
+from hmt_slam_ros.topological_inference.area_comparison import ExaminedArea
+from hmt_slam_ros.topological_inference.candidate_gating import EntryPrior
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 from hmt_slam_ros.topological_inference.place_recognition import (
     PerceptualAliasing,
@@ -24,22 +25,11 @@ from hmt_slam_ros.topological_inference.place_recognition import (
 SIGMA = np.array([0.4, 0.2, 0.1])
 
 
-class GivenGrid:
-    """A grid whose agreement depends on the pose alone."""
-
-    points = np.zeros((50, 2))
-
-    def compare(self, points, pose):
-        assert points is self.points
-        return Agreement(50, round(40 + 5 * pose[0]), round(2 - pose[1]))
-
-
 @pytest.mark.parametrize("expected_probability", [0.5, 0.51])
 @pytest.mark.parametrize("pending", [False, True])
 def test_a_fit_weighs_its_share_of_the_place_its_evidence_and_its_offset(pending, expected_probability):
     search = ClosureSearch(Configuration(), {})
     search._aliasing.add_negatives([0.1, 0.7, 0.85, 0.9])
-    search._grid_cache = SimpleNamespace(grid=lambda _poses: GivenGrid())
     hybrid_map = HybridMap()
     for area in (1, 4):
         hybrid_map.set_keyframe(area, area, np.zeros(3))
@@ -51,20 +41,19 @@ def test_a_fit_weighs_its_share_of_the_place_its_evidence_and_its_offset(pending
         MatchMode(PoseGaussian(np.array(pose), 0.01 * np.eye(3)), PoseGaussian(np.array(pose), np.eye(3)), mass)
         for pose, mass in (((0.8, 0.0, 0.0), 2.0), ((0.0, -1.0, 0.0), 1.0), ((0.0, 0.2, 0.0), -1.0))
     ]
-    place = SimpleNamespace(area=4, grid=GivenGrid())
-    entry = EntryPrior(expected_probability, 2.5)
-    fits = list(search._fits(hybrid_map, place, AreaCandidate(prior, {}, 1.0), modes, entry, 0.3))
+    agreements = [Agreement(50, round(40 + 5 * pose[0]), round(2 - pose[1])) for pose in (m.pose.mean for m in modes)]
+    examined = ExaminedArea(4, prior, EntryPrior(expected_probability, 2.5), tuple(modes), tuple(agreements))
+    fits = list(search._fits(hybrid_map, examined, 0.3))
     total = math.log(sum(math.exp(mode.log_mass) for mode in modes))
     is_expected = pending and expected_probability > 0.5
-    for found, mode, squared in zip(fits, modes, (4.0, 25.0, 1.0), strict=True):
-        agreement = GivenGrid().compare(GivenGrid.points, mode.pose.mean)
+    for found, mode, agreement, squared in zip(fits, modes, agreements, (4.0, 25.0, 1.0), strict=True):
         evidence = MAP_IN_MAP.log_likelihood_ratio(agreement, MAPS_OUTLIER_RATE)
         share = agreement.matched_share
         evidence += search._aliasing.log_distinctiveness(share, already_expected=is_expected)
         offset = -0.5 * max(0.0, squared - 2.5)
         assert (found.area, found.mode) == (4, mode)
         assert found.log_weight == pytest.approx(math.log(0.3) + mode.log_mass - total + evidence + offset)
-    assert list(search._fits(hybrid_map, place, AreaCandidate(prior, {}, 1.0), (), entry, 0.3)) == []
+    assert list(search._fits(hybrid_map, examined._replace(modes=(), agreements=()), 0.3)) == []
 
 
 def test_a_match_is_as_distinctive_as_as_good_ones_elsewhere_are_rare():

@@ -1,5 +1,7 @@
 """Areas in which keyframes surely do not lie: which are tried, and when their maps are made."""
 
+from types import MappingProxyType
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,8 @@ from benchmark.lattice import Lattice, LatticeScans
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map import surroundings
+from hmt_slam_ros.topological_inference import closure_search as module
+from hmt_slam_ros.topological_inference.area_comparison import AreaComparison
 from hmt_slam_ros.topological_inference.candidate_gating import Query
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 
@@ -22,6 +26,21 @@ def lattice():
 def query(hybrid_map):
     keyframes = list(hybrid_map.keyframes(HERE).items())[:5]
     return Query(PoseGaussian(keyframes[0][1], SPREAD), dict(keyframes))
+
+
+def begin(search, hybrid_map, keyframes, compared=MappingProxyType({})):
+    return search.begin_comparison(hybrid_map, HERE, keyframes, compared, {HERE}, 8)
+
+
+def finish(search, hybrid_map, comparison):
+    """The result of a comparison, and what was left of it after each event before the last."""
+    states = []
+    while True:
+        search.begin_event()
+        comparison = search.continue_comparison(hybrid_map, comparison)
+        if isinstance(comparison, AreaComparison):
+            return comparison, states
+        states.append(comparison)
 
 
 def places_tried(search, hybrid_map, excluded):
@@ -46,15 +65,14 @@ def test_their_maps_are_made_ahead_one_at_a_time(lattice, monkeypatch):
     def maps_of(count):
         """Number of grids that a comparison builds after ``count`` calls to look ahead, and its result."""
         search = ClosureSearch(Configuration(), LatticeScans())
-        excluded = {HERE}
         keyframes = query(lattice)
-        search.compare(lattice, HERE, keyframes, dict.fromkeys(range(400), keyframes.poses), excluded, 8)
+        finish(search, lattice, begin(search, lattice, keyframes, dict.fromkeys(range(400), keyframes.poses)))
         for _ in range(count):
             before = len(built)
             search.look_ahead(lattice)
             assert len(built) - before <= 1
         before = len(built)
-        found = search.compare(lattice, HERE, keyframes, {}, excluded, 8)
+        found, _ = finish(search, lattice, begin(search, lattice, keyframes))
         return len(built) - before, [fit.log_weight for fit in found.fits]
 
     without, plain = maps_of(0)
@@ -63,3 +81,73 @@ def test_their_maps_are_made_ahead_one_at_a_time(lattice, monkeypatch):
     assert (without - halfway, without - ahead) == (3, 6)
     assert same == plain
     assert plain
+
+
+def count_work(monkeypatch):
+    """A list to which the number of areas that are compared, and their work, is added."""
+    done = []
+    match = module.match_areas
+
+    def match_areas(query, candidate, *given):
+        found = match(query, candidate, *given)
+        done.append(found.work + module.CELL_WORK * candidate.log_ratio.size)
+        return found
+
+    monkeypatch.setattr(module, "match_areas", match_areas)
+    return done
+
+
+def test_a_wide_comparison_is_spread_over_events_with_the_result_of_a_single_one(lattice, monkeypatch):
+    keyframes, done = query(lattice), count_work(monkeypatch)
+    monkeypatch.setattr(module, "_EVENT_WORK", 10**15)
+    search = ClosureSearch(Configuration(), LatticeScans())
+    at_once, states = finish(search, lattice, begin(search, lattice, keyframes))
+    assert states == []
+    areas, total = len(done), sum(done)
+    done.clear()
+    budget = total // 4
+    monkeypatch.setattr(module, "_EVENT_WORK", budget)
+    search = ClosureSearch(Configuration(), LatticeScans())
+    comparison = begin(search, lattice, keyframes)
+    left, before = [len(comparison.candidates)], 0
+    while not isinstance(comparison, AreaComparison):
+        search.begin_event()
+        comparison = search.continue_comparison(lattice, comparison)
+        works, before = done[before:], len(done)
+        assert sum(works[:-1]) < budget
+        if not isinstance(comparison, AreaComparison):
+            left.append(len(comparison.candidates))
+    assert len(done) == areas
+    assert len(left) >= 4
+    assert left == sorted(left, reverse=True)
+    assert comparison.fits
+    for one, two in zip(comparison.fits, at_once.fits, strict=True):
+        assert (one.area, one.log_weight, one.mode.log_mass) == (two.area, two.log_weight, two.mode.log_mass)
+        np.testing.assert_array_equal(one.mode.pose.mean, two.mode.pose.mean)
+    assert comparison.transition == at_once.transition
+    assert comparison[2:] == at_once[2:]
+
+
+def test_the_hypotheses_of_an_event_share_its_work(lattice, monkeypatch):
+    done = count_work(monkeypatch)
+    search, keyframes = ClosureSearch(Configuration(), LatticeScans()), query(lattice)
+    monkeypatch.setattr(module, "_EVENT_WORK", 1)
+    first, second = (begin(search, lattice, keyframes) for _ in range(2))
+    search.begin_event()
+    first = search.continue_comparison(lattice, first)
+    assert search.continue_comparison(lattice, second).candidates == second.candidates
+    assert len(first.candidates) == len(second.candidates) - 1
+    assert len(done) == 1
+
+
+def test_a_comparison_goes_on_without_areas_that_the_map_lost(lattice, monkeypatch):
+    monkeypatch.setattr(module, "_EVENT_WORK", 1)
+    search = ClosureSearch(Configuration(), LatticeScans())
+    comparison = search.continue_comparison(lattice, begin(search, lattice, query(lattice)))
+    (examined,) = comparison.examined
+    left = list(comparison.candidates)
+    for area in (examined.area, left[0]):
+        lattice.merge(area, left[-1], PoseGaussian(np.zeros(3), np.eye(3)))
+    found, _ = finish(search, lattice, comparison)
+    assert not {examined.area, left[0]} & found.transition.known.keys()
+    assert set(left[1:]) & found.transition.known.keys()

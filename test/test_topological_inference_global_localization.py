@@ -150,6 +150,7 @@ def test_an_event_searches_the_most_probable_regions_until_its_work_is_done():
     probabilities = {0: 0.05, 1: 0.1, 2: 0.2, 3: 0.4, 4: 0.15, 5: 0.1}
     search = continue_search(begin_search(map_of(6), {9: np.zeros(3)}, 9, probabilities), matcher, map_of(6), first=1)
     assert matcher.searched == [1, 3]
+    assert search.is_exhausted
     # Area 2 was merged with another one.
     hybrid_map = map_of(6)
     hybrid_map.merge(2, 3, PoseGaussian(np.zeros(3), np.eye(3)))
@@ -160,7 +161,17 @@ def test_an_event_searches_the_most_probable_regions_until_its_work_is_done():
     assert search.fitting_areas == {1, 2, 3, 4, 5, 6}
     assert [candidate.area for candidate in search.candidates] == [1, 3, 4, 5]
     assert continue_search(search, matcher, hybrid_map).unexamined == {}
-    assert continue_search(search, GivenWalls({}, 0), hybrid_map).unexamined == {}
+    rest = continue_search(search, GivenWalls({}, 0), hybrid_map)
+    assert (rest.unexamined, rest.is_exhausted) == ({}, False)
+
+
+def test_candidates_that_were_refuted_wait_for_another_or_for_the_end():
+    fit = Agreement(400, 400, 0)
+    candidates = tuple(make_candidate(area)._replace(agreement=fit) for area in (4, 5))
+    for count, refuted, left, conclusive in ((1, 0, 1, True), (1, 1, 1, False), (2, 1, 1, True), (1, 1, 0, True)):
+        unexamined = {1: 0.1} if left else {}
+        search = GlobalSearch({}, 9, 5, unexamined, candidates[:count], refuted=refuted)
+        assert is_conclusive(search, 0.01, HybridMap(), NO_CLUTTER, None, 0.3) is conclusive
 
 
 def test_what_was_not_searched_may_match_as_well_and_the_candidate_by_chance():

@@ -15,7 +15,7 @@ from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
 from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
-from hmt_slam_ros.topological_inference import kidnapping, relocalization
+from hmt_slam_ros.topological_inference import global_localization, kidnapping, relocalization
 from hmt_slam_ros.topological_inference.branching import Branches, Parent
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseDistribution, PoseHint
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
@@ -145,6 +145,7 @@ class GivenSearch(SimpleNamespace):
     def __init__(self, events=1, **given):
         super().__init__(first_areas=[], remaining=events, **given)
         self.search = SimpleNamespace(
+            is_exhausted=False,
             begin_global_search=self.begin,
             continue_global_search=self.go_on,
             is_conclusive=lambda _map, _search, _clutter, _hint=None: self.remaining == 0,
@@ -221,6 +222,50 @@ def test_a_search_goes_on_with_its_keyframes_until_it_is_over():
     relocalization.update_relocalization(branching, parent)
     assert branching.first_areas[3:] == [1]
     assert branching.only == {1, 2}
+
+
+class ExhaustingSearch(GivenSearch):
+    """A search that takes the work of every event, and leaves an area where something fits."""
+
+    def go_on(self, hybrid_map, search, first=None):
+        search = super().go_on(hybrid_map, search, first)
+        left = {3: 0.1} if search.candidates else {}
+        return replace(search, event_work=global_localization._EVENT_WORK, unexamined=left)
+
+
+@pytest.mark.parametrize(("probability", "refuted"), [(0.9, 0), (0.5, 1)])
+def test_candidates_are_tested_at_the_event_after_a_search_that_took_the_work(probability, refuted):
+    """Where they are refuted the search goes on, and they are not tested again before there is another."""
+    pair = (candidate(1, [2.0, 1.0, 0.4]), probability)
+    branching, parent = ExhaustingSearch(options=OPTIONS, found=distribution(pair)), make_parent(Lost(21))
+    (child,) = (found := relocalization.update_relocalization(branching, parent)).children
+    assert not found.closures_searched
+    assert child.state.localization.search.is_exhausted
+    (child,) = relocalization.update_relocalization(branching, replace(parent, state=child.state)).children
+    lost = child.state.localization
+    assert len(branching.first_areas) == 1
+    if not refuted:
+        assert (lost.search, lost.candidate.area) == (None, 1)
+        return
+    assert (lost.search.refuted, lost.search.is_exhausted, lost.candidate) == (1, False, None)
+    branching.remaining = 2
+    (child,) = relocalization.update_relocalization(branching, replace(parent, state=child.state)).children
+    assert len(branching.first_areas) == 2
+    assert child.state.localization.search.refuted == 1
+
+
+def test_a_search_without_candidates_ends_at_once():
+    branching, parent = ExhaustingSearch(options=OPTIONS, found=distribution()), make_parent(Lost(21))
+    found = relocalization.update_relocalization(branching, parent)
+    assert found.pose_distribution is branching.found
+
+
+def test_a_search_waits_at_an_event_whose_work_is_done():
+    branching, parent = GivenSearch(options=OPTIONS, found=distribution()), make_parent(Lost(21))
+    branching.search.is_exhausted = True
+    (child,) = relocalization.update_relocalization(branching, parent).children
+    assert child.state is parent.state
+    assert branching.first_areas == []
 
 
 def test_a_search_whose_keyframes_left_the_submap_is_given_up():

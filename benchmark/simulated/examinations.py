@@ -23,12 +23,13 @@ from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 from hmt_slam_ros.registration.match_modes import log_ratio_at
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.topological_inference.area_comparison import AreaComparison, Fit, OngoingComparison
 from hmt_slam_ros.topological_inference.branching import Branches, Branching, Parent
 from hmt_slam_ros.topological_inference.candidate_gating import Query, entry_prior
-from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch, Fit
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 from hmt_slam_ros.topological_inference.place_recognition import ScanDescriptors, descriptor_log_ratio
 
-_Comparison = tuple[Query, Mapping[int, Collection[int]], frozenset[int], AreaComparison]
+_Comparison = tuple[Query, frozenset[int], AreaComparison]
 _VIEWS = 3
 _NAN = math.nan
 _NO_MATCH = (0, _NAN, 0, 0)
@@ -87,9 +88,12 @@ ExaminationListener = Callable[[Examination], None]
 class ObservedBranching(Branching):
     """A branching that passes its examinations to a listener."""
 
-    def __init__(self, configuration: Configuration, replica: Replica, listener: ExaminationListener) -> None:
+    def __init__(
+        self, configuration: Configuration, replica: Replica, listener: ExaminationListener, *, is_bounded: bool = True
+    ) -> None:
+        """:param is_bounded: whether comparisons go on at the next event, which needs an area abstraction."""
         super().__init__(configuration, replica, composition.landmark_evidence)
-        self.search = self._observed_search = _ObservedSearch(configuration, replica.scans)
+        self.search = self._observed_search = _ObservedSearch(configuration, replica.scans, is_bounded=is_bounded)
         self._descriptors = ScanDescriptors(replica.scans)
         self._listener = listener
 
@@ -97,43 +101,43 @@ class ObservedBranching(Branching):
         """As of the base class, with the listener."""
         return self._report("cut", parent, super().cut(parent, keyframes))
 
-    def recheck(self, parent: Parent, only: Collection[int] = ()) -> Branches:
+    def continue_comparison(self, parent: Parent, comparison: OngoingComparison) -> Branches:
         """As of the base class, with the listener."""
-        return self._report("recheck", parent, super().recheck(parent, only))
+        return self._report("recheck", parent, super().continue_comparison(parent, comparison))
 
     def _report(self, kind: str, parent: Parent, branches: Branches) -> Branches:
         if (comparison := self._observed_search.take()) is not None:
-            query, compared, excluded, found = comparison
-            views = self._observed_search.views
+            query, excluded, found = comparison
+            views, compared = self._observed_search.views, parent.state.matched_keyframes
             self._listener(Examination(kind, parent, query, compared, excluded, found, views, self._descriptors))
         return branches
 
 
 class _ObservedSearch(ClosureSearch):
-    """A closure search that keeps its last comparison."""
+    """A closure search that keeps its last comparison that ended."""
 
-    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
+    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan], *, is_bounded: bool) -> None:
         super().__init__(configuration, scans)
+        self._is_bounded = is_bounded
         self._last: _Comparison | None = None
+
+    @property
+    def is_exhausted(self) -> bool:
+        """As of the base class, where the work of an event is bounded."""
+        return self._is_bounded and super().is_exhausted
 
     @property
     def views(self) -> GridCache:
         """Cached grids."""
         return self._grid_cache
 
-    def compare(
-        self,
-        hybrid_map: HybridMap,
-        area: int,
-        query: Query,
-        compared: Mapping[int, Collection[int]],
-        excluded: Collection[int],
-        most: int,
-        only: Collection[int] = (),
-    ) -> AreaComparison:
+    def continue_comparison(
+        self, hybrid_map: HybridMap, comparison: OngoingComparison
+    ) -> OngoingComparison | AreaComparison:
         """As of the base class, with the listener."""
-        found = super().compare(hybrid_map, area, query, compared, excluded, most, only)
-        self._last = query, compared, frozenset(excluded), found
+        found = super().continue_comparison(hybrid_map, comparison)
+        if isinstance(found, AreaComparison):
+            self._last = comparison.query, comparison.excluded, found
         return found
 
     def take(self) -> _Comparison | None:

@@ -38,6 +38,9 @@ _WEAK_PRIOR_SHARE = 0.01
 _SAME_MODE_GATE = chi_square_gate(0.95)
 """Squared Mahalanobis distance below which two modes are the same."""
 
+_MODES_WORK = 10_000
+"""Work for the modes of a match: so many times all samples are looked up, about."""
+
 _MARGIN = 20.0
 """Log-mass below that of the best mode down to which modes are used, nats: the best may be in another area's place."""
 
@@ -95,9 +98,11 @@ class AreaMatch:
 
     :ivar log_evidence: log of the integral of p(x) (p(z | x, candidate) / p(z | unknown))^temper over the gate, nats;
         -inf where all of it is negligible.
+    :ivar work: number of samples that are looked up for the search and for the modes.
     """
 
     log_evidence: float = -math.inf
+    work: int = 0
     _find_modes: Callable[[], tuple[MatchMode, ...]] = tuple
 
     # On demand: for some comparisons the evidence is enough.
@@ -124,10 +129,11 @@ def match_areas(
         points, m.
     :param cells: those of :func:`find_cells` with the same arguments, if they are known.
     """
-    result = _search(query, candidate, prior, settings, bounds, cells)
+    result, work = _search(query, candidate, prior, settings, bounds, cells)
     if result is None:
-        return AreaMatch()
-    return AreaMatch(float(np.logaddexp.reduce(result.masses)), lambda: tuple(_modes(result)))
+        return AreaMatch(work=work)
+    work += _MODES_WORK * len(query.points)
+    return AreaMatch(float(np.logaddexp.reduce(result.masses)), work, lambda: tuple(_modes(result)))
 
 
 def find_cells(
@@ -172,7 +178,7 @@ def best_pose(
 
     It costs a fraction of the mode with its covariance.
     """
-    result = _search(query, candidate, prior, settings)
+    result, _ = _search(query, candidate, prior, settings)
     if result is None:
         return None
     labels, totals = _cluster(result)
@@ -188,19 +194,19 @@ def _search(
     settings: MatchSettings,
     bounds: Float64 | None = None,
     cells: SearchCells | None = None,
-) -> _SearchResult | None:
-    """The cells of a search, None without any."""
+) -> tuple[_SearchResult | None, int]:
+    """The cells of a search, None without any, and the number of samples that it looked up."""
     if not query.points.size or not candidate.points.size:
-        return None
+        return None, 0
     if cells is None:
         cells = find_cells(query, _coarse_grid(candidate), candidate.points, prior, settings, bounds)
     if not cells.score.size:
-        return None
+        return None, cells.work
     centered, surface = _center(query, candidate.cell, prior, settings, bounds), _fine_grid(candidate)
     samples, window = centered.query.points, centered.window
     problem = _MatchProblem(surface, samples, window, centered.prior, settings, centered.to_middle)
     masses, poses = match_modes.integrate_cells(surface, samples, window, cells, settings.temper)
-    return _SearchResult(problem, cells, masses + centered.log_cell, poses)
+    return _SearchResult(problem, cells, masses + centered.log_cell, poses), cells.work
 
 
 def _center(

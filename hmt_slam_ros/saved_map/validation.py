@@ -230,6 +230,8 @@ def _check_hypothesis_state(one: Any, state: Any, own: HypothesisMap, path: str)
     require_keyframes(own, one.covariances, f"{path}.covariances")
     missing = set(one.unmatched_keyframes) - one.covariances.keys()
     require(not missing, f"{path}.unmatched_keyframes", sorted(missing), "keyframes of covariances")
+    if one.comparison is not None:
+        _check_comparison(one.comparison, f"{path}.comparison")
     for event, pose in one.unstored_poses.items():
         is_stored = pose.keyframe == event and event in state.branching.unstored_scans
         require(is_stored, f"{path}.unstored_poses", event, "an event of unstored_scans")
@@ -243,6 +245,18 @@ def _check_hypothesis_state(one: Any, state: Any, own: HypothesisMap, path: str)
             require(bool(lost.search.poses), f"{path}.localization.search.poses", "empty", "one keyframe at least")
     elif one.localization.relocalized_area is not None:
         require_areas(own, [one.localization.relocalized_area], f"{path}.localization.relocalized_area")
+
+
+def _check_comparison(comparison: Any, path: str) -> None:  # noqa: ANN401
+    """Check that a comparison that goes on can be continued; areas that the map lacks are dropped then."""
+    require(bool(comparison.query.poses), f"{path}.query.poses", "empty", "one keyframe at least")
+    for known, candidate in comparison.candidates.items():
+        keyframes = candidate.unmatched_poses.keys()
+        is_part = bool(keyframes) and keyframes <= comparison.query.poses.keys()
+        require(is_part, f"{path}.candidates[{known}].unmatched_poses", list(keyframes), "keyframes of query")
+    for one in comparison.examined:
+        is_whole = len(one.agreements) == len(one.modes) and 0.0 <= one.entry.probability <= 1.0
+        require(is_whole, f"{path}.examined", one.area, "an area with a probability, and an agreement for each mode")
 
 
 def _check_tlca(state: Any, path: str) -> None:  # noqa: ANN401

@@ -24,13 +24,18 @@ from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import connected_neighbors, informative_arc, shortest_path_beliefs
 from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions, min_distance
 from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, AreaMerge, MovedKeyframe
-from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
 from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.relative_motion import is_wide
+from hmt_slam_ros.topological_inference.area_comparison import (
+    AreaComparison,
+    ComparisonKind,
+    Fit,
+    OngoingComparison,
+)
 from hmt_slam_ros.topological_inference.candidate_gating import Query
-from hmt_slam_ros.topological_inference.closure_search import AreaComparison, ClosureSearch, Fit, SearchState
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, SearchState
 from hmt_slam_ros.topological_inference.global_localization import (
     GlobalSearch,
     LandmarkEvidence,
@@ -194,8 +199,7 @@ class Branching:
         """Prepare the next search, at an event without one."""
         localizations = [(parent.hybrid_map, parent.state.localization) for parent in parents]
         lost_maps = [(hybrid_map, lost.since) for hybrid_map, lost in localizations if isinstance(lost, Lost)]
-        if not lost_maps:
-            self.search.look_ahead(max(parents, key=lambda parent: parent.log_weight).hybrid_map)
+        self.search.look_ahead(max(parents, key=lambda parent: parent.log_weight).hybrid_map)
         if lost_maps and self.landmarks is not None:
             self.landmarks.prepare_places(lost_maps)
 
@@ -219,8 +223,9 @@ class Branching:
             self.unstored_scans[event] = scan
 
     def begin_event(self) -> None:
-        """Begin an event, within which hypotheses share the numbers of new areas with the same keyframes."""
+        """Begin an event, in which hypotheses share its work, and the numbers of new areas with the same keyframes."""
         self._new_areas = {}
+        self.search.begin_event()
 
     def reweight_by_known_ground(self, parent: Parent, pose: Float64, points: Float64, keyframe: int) -> Parent:
         """The hypothesis with the evidence of the newest scan for the known ground around it.
@@ -237,19 +242,42 @@ class Branching:
         """Branch over a new area and every known area that the arcs admit, with one child per mode.
 
         Where the keyframes lie in the place of an area of the submap there is one child: the robot is tracked there.
+        Until the comparison with known areas ends nothing is cut: area abstraction repeats the cut. But where the arcs
+        are too wide for one area, the keyframes begin a new one at once, and are compared there.
         """
-        query = self.query(parent, keyframes)
-        local_areas = parent.local_area_poses()
+        query, ongoing = self.query(parent, keyframes), parent.state.comparison
         if is_wide(query.belief.covariance, self._filter):
-            local_areas = {}
-        tracked = self.search.tracked_area(parent.hybrid_map, parent.area, local_areas, query.poses_in_area)
-        if tracked is not None:
-            return Branches([self._enter_tracked(parent, query, tracked)])
-        proposed = parent
+            found = self._compare_cut(parent, query, {parent.area})
+            if isinstance(found, OngoingComparison):
+                return Branches([self._enter_meanwhile(parent, found)])
+            return self._branch_at_cut(parent, query, found)
+        if ongoing is None:
+            local_areas = parent.local_area_poses()
+            tracked = self.search.tracked_area(parent.hybrid_map, parent.area, local_areas, query.poses_in_area)
+            if tracked is not None:
+                return Branches([self._enter_tracked(parent, query, tracked)])
+            found = self._compare_cut(parent, query, {parent.area, *local_areas})
+        elif ongoing.kind == "cut" and ongoing.query.poses.keys() <= set(keyframes):
+            found = self.search.continue_comparison(parent.hybrid_map, ongoing)
+            query = self.query(parent, keyframes, next(iter(ongoing.query.poses)))
+        else:
+            return self.continue_comparison(parent, ongoing)
+        if isinstance(found, OngoingComparison):
+            return Branches([self._wait(parent, found)])
+        return self._branch_at_cut(parent, query, found)
+
+    def _compare_cut(
+        self, parent: Parent, query: Query, excluded: Collection[int]
+    ) -> OngoingComparison | AreaComparison:
+        """The comparison of the keyframes that leave the robot's area, after its first event."""
         if self.landmarks is not None and parent.probability >= MIN_PROPOSAL_PROBABILITY:
-            proposed = replace(parent, hybrid_map=self.landmarks.propose_loop(parent.hybrid_map, parent.area))
-        found = self._compare_areas(proposed, query, {parent.area, *local_areas})
-        state = parent.state.after_matching(found.examined_areas, keyframes, found.pending_candidates)
+            parent = replace(parent, hybrid_map=self.landmarks.propose_loop(parent.hybrid_map, parent.area))
+        comparison = self._begin_comparison(parent, query, excluded, "cut")
+        return self.search.continue_comparison(parent.hybrid_map, comparison)
+
+    def _branch_at_cut(self, parent: Parent, query: Query, found: AreaComparison) -> Branches:
+        """The children of a cut after the comparison."""
+        state = parent.state.after_matching(found.examined_areas, list(query.poses), found.pending_candidates)
         parent = replace(parent, state=state)
         children = [self._enter_new(parent, query, math.log(found.transition.new))]
         children += [self._enter_known(parent, query, fit) for fit in found.fits]
@@ -264,19 +292,50 @@ class Branching:
         own = parent.hybrid_map.keyframes(parent.area)
         keyframes = [k for k in (newest if only else parent.state.unmatched_keyframes) if k in own]
         query = self.query(parent, keyframes)
-        excluded = {parent.area, *parent.local_area_poses(), *self._certain_neighbors(parent)}
         if self.landmarks is not None and parent.probability >= MIN_PROPOSAL_PROBABILITY:
             self.landmarks.prepare_loops(parent.hybrid_map, parent.area)
-        found = self._compare_areas(parent, query, excluded, only)
+        kind: ComparisonKind = "retry" if only else "recheck"
+        if kind == "recheck":
+            # Without those that the area lost.
+            parent = replace(parent, state=replace(parent.state, unmatched_keyframes=tuple(keyframes)))
+        comparison = self._begin_comparison(parent, query, self._joined_areas(parent), kind, only)
+        return self.continue_comparison(parent, comparison)
+
+    def continue_comparison(self, parent: Parent, comparison: OngoingComparison) -> Branches:
+        """Branch over no change and further arcs from the robot's area, as soon as the comparison has ended."""
+        found = self.search.continue_comparison(parent.hybrid_map, comparison)
+        if isinstance(found, OngoingComparison):
+            return Branches([self._wait(parent, found)])
+        is_retry, keyframes = comparison.kind == "retry", list(comparison.query.poses)
         state = parent.state.after_matching(
-            found.examined_areas, keyframes, found.pending_candidates, all_areas=not only
+            found.examined_areas, keyframes, found.pending_candidates, all_areas=not is_retry
         )
         parent = replace(parent, state=state)
+        # Another event may have joined an area meanwhile.
+        joined = self._joined_areas(parent)
+        fits = [fit for fit in found.fits if fit.area not in joined]
         # The probability that they are in no place counted when they fitted beside it.
-        log_new = 0.0 if only and not found.fits else math.log(found.transition.new)
+        log_new = 0.0 if is_retry and not fits else math.log(found.transition.new)
         stay = replace(parent.unchanged_child(), log_weight=parent.log_weight + log_new)
-        children = [stay, *(self._join(parent, query, fit) for fit in found.fits)]
+        children = [stay, *(self._join(parent, comparison.query, fit) for fit in fits)]
         return Branches(children, True, _log(found.skipped_weight) + parent.log_weight)
+
+    @staticmethod
+    def _wait(parent: Parent, comparison: OngoingComparison) -> Child:
+        """The only child while a comparison goes on."""
+        return parent.unchanged_child(replace(parent.state, comparison=comparison))
+
+    def _enter_meanwhile(self, parent: Parent, comparison: OngoingComparison) -> Child:
+        """The only child, in a new area of the keyframes, while their comparison goes on."""
+        child = self._enter_new(parent, comparison.query, 0.0)
+        reference = next(iter(comparison.query.poses))
+        belief = PoseGaussian(np.zeros(3), child.state.covariances[reference] + self._covariance_floor)
+        comparison = replace(comparison, query=Query(belief, comparison.query.poses), kind="recheck")
+        return replace(child, state=replace(child.state, comparison=comparison))
+
+    def _joined_areas(self, parent: Parent) -> set[int]:
+        """The robot's area and those that are joined to it."""
+        return {parent.area, *parent.local_area_poses(), *self._certain_neighbors(parent)}
 
     def _certain_neighbors(self, parent: Parent) -> set[int]:
         """The areas that an arc joins to the robot's, but none that is too wide for one submap."""
@@ -284,16 +343,21 @@ class Branching:
         arcs = {area: informative_arc(parent.hybrid_map, parent.area, area) for area in neighbors}
         return {area for area, arc in arcs.items() if arc is None or not is_wide(arc.covariance, self._filter)}
 
-    def _compare_areas(
-        self, parent: Parent, query: Query, excluded: Collection[int], only: Collection[int] = ()
-    ) -> AreaComparison:
+    def _begin_comparison(
+        self,
+        parent: Parent,
+        query: Query,
+        excluded: Collection[int],
+        kind: ComparisonKind,
+        only: Collection[int] = (),
+    ) -> OngoingComparison:
         """The comparison with known areas, more of them the more probable the hypothesis is."""
         most = min(
             self.options.max_candidates,
             max(MIN_EXAMINED_AREAS, math.ceil(self.options.max_comparisons * parent.probability)),
         )
-        return self.search.compare(
-            parent.hybrid_map, parent.area, query, parent.state.matched_keyframes, excluded, most, only
+        return self.search.begin_comparison(
+            parent.hybrid_map, parent.area, query, parent.state.matched_keyframes, excluded, most, kind, only
         )
 
     def move(self, parent: Parent, area: int) -> Branches:
@@ -344,11 +408,14 @@ class Branching:
         belief = arc or shortest_path_beliefs(parent.hybrid_map, parent.area, targets=(area,))[area]
         return PoseGaussian(parent.state.local_area_poses.get(area, belief.mean), belief.covariance)
 
-    def query(self, parent: Parent, keyframes: Sequence[int]) -> Query:
-        """The query of some keyframes of the robot's area."""
-        poses = parent.hybrid_map.keyframes(parent.area)
-        reference = poses[keyframes[0]]
-        covariance = parent.covariance(keyframes[0]) + self._covariance_floor
+    def query(self, parent: Parent, keyframes: Sequence[int], first: int | None = None) -> Query:
+        """The query of some keyframes of the robot's area.
+
+        :param first: the reference among them; the first of them if None.
+        """
+        poses, first = parent.hybrid_map.keyframes(parent.area), keyframes[0] if first is None else first
+        reference = poses[first]
+        covariance = parent.covariance(first) + self._covariance_floor
         relative_poses = {keyframe: se2.between(reference, poses[keyframe]) for keyframe in keyframes}
         return Query(PoseGaussian(reference, covariance), relative_poses)
 
@@ -446,57 +513,3 @@ def _frame_change(query: Query, entry: PoseGaussian, covariances: Mapping[int, F
 
 def _log(value: float) -> float:
     return math.log(value) if value > 0.0 else -math.inf
-
-
-def merge_areas(parent: Parent, area: int, into: int, search: ClosureSearch) -> Child:
-    """The child in which ``area`` is part of ``into``, or an unchanged one where their surfaces contradict.
-
-    :param search: compares them.
-    """
-    child = parent.unchanged_child()
-    belief = parent.hybrid_map.arc(into, area)
-    if belief is None or not search.is_same_place(parent.hybrid_map, into, area, belief.mean):
-        return child
-    child = replace(child, reload_local_map=True, area_merge=AreaMerge(area, into, belief))
-    if parent.area != area:
-        return child
-    poses = parent.hybrid_map.keyframes(area)
-    covariances = {
-        k: belief.compose(PoseGaussian(poses[k], covariance)).covariance
-        for k, covariance in parent.state.covariances.items()
-        if k in poses
-    }
-    return replace(child, area=into, state=parent.state.after_area_change(covariances), frame_change=belief)
-
-
-def apply_revision(parent: Parent, explanation: Hypothesis, newest: int) -> Child:
-    """The child that follows one of TLCA's explanations; all areas may be compared again.
-
-    :param explanation: it lacks the keyframe that came since.
-    :param newest: that keyframe.
-    """
-    moved = explanation.moved_keyframes
-    if explanation.frame_change is not None and newest in parent.hybrid_map.keyframes(parent.area):
-        pose = se2.compose(explanation.frame_change.mean, parent.hybrid_map.keyframes(parent.area)[newest])
-        moved += (MovedKeyframe(newest, parent.area, explanation.area, pose),)
-    return Child(
-        parent.hypothesis,
-        parent.log_weight + math.log(explanation.probability),
-        explanation.area,
-        _state_after_revision(parent, explanation, {m.keyframe for m in moved if m.area == explanation.area}),
-        explanation.frame_change,
-        moved,
-        explanation.arcs,
-        reload_local_map=True,
-        removed_arcs=explanation.removed_arcs,
-    )
-
-
-def _state_after_revision(parent: Parent, explanation: Hypothesis, moved: set[int]) -> HypothesisState:
-    """The state without comparisons; in another area, only of the keyframes that moved there."""
-    state = replace(parent.state, matched_keyframes={}, unlinked_overlap=None)
-    if explanation.area == parent.area:
-        return state
-    covariances = {keyframe: covariance for keyframe, covariance in state.covariances.items() if keyframe in moved}
-    unmatched = tuple(keyframe for keyframe in state.unmatched_keyframes if keyframe in moved)
-    return HypothesisState(covariances, unmatched_keyframes=unmatched)

@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,12 +28,18 @@ from hmt_slam_ros.registration.consistency import MAP_IN_MAP, MAPS_OUTLIER_RATE,
 from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid, surface_points
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.relative_motion import is_wide
+from hmt_slam_ros.topological_inference.area_comparison import (
+    AreaComparison,
+    ComparisonKind,
+    ExaminedArea,
+    Fit,
+    OngoingComparison,
+)
 from hmt_slam_ros.topological_inference.candidate_gating import (
     AreaCandidate,
     CandidateGating,
     EntryPrior,
     Query,
-    Transition,
     entry_prior,
     transition_model,
 )
@@ -47,7 +52,12 @@ from hmt_slam_ros.topological_inference.global_localization import (
     is_conclusive,
     localize_globally,
 )
-from hmt_slam_ros.topological_inference.global_scan_matching import FreeSpaceCheck, GlobalScanMatcher, query_bounds
+from hmt_slam_ros.topological_inference.global_scan_matching import (
+    CELL_WORK,
+    FreeSpaceCheck,
+    GlobalScanMatcher,
+    query_bounds,
+)
 from hmt_slam_ros.topological_inference.place_recognition import (
     MIN_LOG_RATIO,
     NegativeSample,
@@ -64,35 +74,8 @@ _OLD_EVENTS = 30
 _OLD_STEP = 20
 """Keyframe events between two changes of that known ground, so that its grid stays cached."""
 
-
-class Fit(NamedTuple):
-    """One way in which the keyframes lie in a known area.
-
-    :ivar log_weight: log pi p(z), p(z) relative to new ground, nats. The appearance of the place adds nothing to the
-        evidence of its surfaces (`python -m benchmark evidence`).
-    """
-
-    area: int
-    mode: MatchMode
-    log_weight: float
-
-
-class AreaComparison(NamedTuple):
-    """The comparison of keyframes with the known areas.
-
-    :ivar transition: pi of the known areas and of new ground.
-    :ivar fits: the heaviest modes in each examined area.
-    :ivar examined_areas: those areas.
-    :ivar pending_candidates: areas beside whose place the keyframes fit; they are not in it yet, so they were not
-        examined.
-    :ivar skipped_weight: weight of the other areas and modes, on the scale of ``exp(Fit.log_weight)``.
-    """
-
-    transition: Transition
-    fits: tuple[Fit, ...]
-    examined_areas: tuple[int, ...]
-    pending_candidates: tuple[int, ...]
-    skipped_weight: float
+_EVENT_WORK = 40_000_000
+"""Work after which an event begins no further comparison or search: samples looked up, about 40 ms."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +117,7 @@ class ClosureSearch:
             options.local_reach,
         )
         self._newest_sampled = -1
+        self._event_work = 0
         self._look_ahead_queue: list[tuple[int, Collection[int]]] = []
 
     @property
@@ -207,7 +191,7 @@ class ClosureSearch:
         grid = self._grid_cache.grid_before(hybrid_map, poses, before)
         return SCAN_IN_STORED_MAP.log_likelihood_ratio(grid.compare(points, pose), MAPS_OUTLIER_RATE)
 
-    def compare(
+    def begin_comparison(
         self,
         hybrid_map: HybridMap,
         area: int,
@@ -215,55 +199,93 @@ class ClosureSearch:
         compared: Mapping[int, Collection[int]],
         excluded: Collection[int],
         most: int,
+        kind: ComparisonKind = "recheck",
         only: Collection[int] = (),
-    ) -> AreaComparison:
-        """Prior and evidence of all admitted areas.
+    ) -> OngoingComparison:
+        """The comparison of keyframes with all admitted areas, before the first one.
 
         :param area: the area that the keyframes are in.
         :param compared: {known area: keyframes that were compared with it}.
         :param excluded: areas that are neither candidates nor part of a candidate's map.
         :param most: at most this many areas are examined, the most probable.
-        :param only: the only areas to examine; all if empty.
+        :param only: the only areas to examine in a retry.
         """
         within, unexamined, elsewhere = self.gating.classify_areas(hybrid_map, area, query, excluded)
-        if only:
+        if kind == "retry":
             within, unexamined = {known: prior for known, prior in within.items() if known in only}, {}
         self._look_ahead_queue = [(other, excluded) for other in elsewhere if within]
         candidates = self.gating.candidates(hybrid_map, query, compared, within)
         ranked = sorted(candidates, key=lambda known: (-candidates[known].max_probability, known))
-        skipped = {known: candidates[known].max_probability for known in ranked[most:]} | unexamined
-        sampled = elsewhere if ranked[:most] and max(query.poses) != self._newest_sampled else ()
-        # The grids of candidates come last, since they may evict others from the cache.
-        negatives = [self._negative_sample(hybrid_map, other, excluded) for other in sampled]
-        places = {known: self._grid_cache.place(hybrid_map, known, excluded) for known in ranked[:most]}
-        entries = {known: self._entry_probability(place, candidates[known]) for known, place in places.items()}
-        priors = {known: entry.probability for known, entry in entries.items() if entry.probability > 0.0}
-        modes = {known: self._modes(places[known], candidates[known]) for known in priors}
-        pending = tuple(known for known, own in modes.items() if own is None)
-        transition = transition_model(priors | skipped, self._options.new_probability)
+        return OngoingComparison(
+            query,
+            frozenset(excluded),
+            kind,
+            {known: candidates[known] for known in ranked[:most]},
+            {known: candidates[known].max_probability for known in ranked[most:]} | unexamined,
+            tuple(elsewhere),
+        )
+
+    def begin_event(self) -> None:
+        """Begin an event, whose comparisons and searches share its work."""
+        self._event_work = 0
+
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether the work of the event is done, after which nothing else begins."""
+        return self._event_work >= _EVENT_WORK
+
+    def continue_comparison(
+        self, hybrid_map: HybridMap, comparison: OngoingComparison
+    ) -> OngoingComparison | AreaComparison:
+        """The comparison after this event, or its result if it ended within the work of the event.
+
+        Candidates that the map lacks by now are dropped.
+        """
+        candidates = {known: c for known, c in comparison.candidates.items() if hybrid_map.has_area(known)}
+        examined = [one for one in comparison.examined if hybrid_map.has_area(one.area)]
+        while candidates and not self.is_exhausted:
+            known = next(iter(candidates))
+            examined.append(self._examine(hybrid_map, known, candidates.pop(known), comparison.excluded))
+        comparison = replace(comparison, candidates=candidates, examined=tuple(examined))
+        if candidates or self.is_exhausted:
+            return comparison
+        return self._conclude(hybrid_map, comparison)
+
+    def _examine(
+        self, hybrid_map: HybridMap, known: int, candidate: AreaCandidate, excluded: Collection[int]
+    ) -> ExaminedArea:
+        """The comparison with one area."""
+        place = self._grid_cache.place(hybrid_map, known, excluded)
+        self._event_work += CELL_WORK * place.grid.log_ratio.size
+        entry = self._entry_probability(place, candidate)
+        if entry.probability == 0.0:
+            return ExaminedArea(known, candidate.prior, entry)
+        modes = self._modes(place, candidate)
+        if modes is None:
+            return ExaminedArea(known, candidate.prior, entry, is_pending=True)
+        points = self._grid_cache.grid(candidate.unmatched_poses).points
+        agreements = tuple(place.grid.compare(points, mode.pose.mean) for mode in modes)
+        return ExaminedArea(known, candidate.prior, entry, tuple(modes), agreements)
+
+    def _conclude(self, hybrid_map: HybridMap, comparison: OngoingComparison) -> AreaComparison:
+        """Prior and evidence of all areas that were examined."""
+        examined = [one for one in comparison.examined if one.entry.probability > 0.0]
+        priors = {one.area: one.entry.probability for one in examined}
+        transition = transition_model(priors | dict(comparison.skipped), self._options.new_probability)
         if priors:
-            self._sample_aliasing(query, negatives)
-        fits = [
-            fit
-            for known in sorted(priors, key=lambda known: (-priors[known], known))
-            for fit in self._fits(
-                hybrid_map,
-                places[known],
-                candidates[known],
-                modes[known] or (),
-                entries[known],
-                transition.known[known],
-            )
-        ]
+            self._sample_aliasing(hybrid_map, comparison)
+        in_order = sorted(examined, key=lambda one: (-one.entry.probability, one.area))
+        fits = [fit for one in in_order for fit in self._fits(hybrid_map, one, transition.known[one.area])]
         kept, dropped = _split_heaviest(fits, self._options.max_modes)
-        skipped_weight = sum(transition.known[known] for known in skipped)
+        skipped_weight = sum(transition.known[known] for known in comparison.skipped)
         skipped_weight += sum(math.exp(fit.log_weight) for fit in dropped)
-        examined = tuple(known for known in priors if known not in pending)
-        return AreaComparison(transition, kept, examined, pending, skipped_weight)
+        pending = tuple(one.area for one in examined if one.is_pending)
+        compared = tuple(one.area for one in examined if not one.is_pending)
+        return AreaComparison(transition, kept, compared, pending, skipped_weight)
 
     def look_ahead(self, hybrid_map: HybridMap) -> None:
         """Build the grid of one area of the next negative sample, at an event without a search."""
-        while self._look_ahead_queue:
+        while self._look_ahead_queue and not self._event_work:
             area, excluded = self._look_ahead_queue.pop()
             if hybrid_map.has_area(area):
                 self._negative_sample(hybrid_map, area, excluded)
@@ -296,7 +318,9 @@ class ClosureSearch:
 
         :param first: the area whose region comes first, if it was not searched yet.
         """
-        return continue_search(search, self._global_matcher, hybrid_map, first)
+        search = continue_search(search, self._global_matcher, hybrid_map, first)
+        self._event_work += search.event_work
+        return search
 
     def is_conclusive(
         self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
@@ -327,12 +351,15 @@ class ClosureSearch:
     def _entry_probability(self, place: AreaPlace, candidate: AreaCandidate) -> EntryPrior:
         return entry_prior(place, candidate.prior, stack_poses(candidate.unmatched_poses), self._options.place_radius)
 
-    def _sample_aliasing(self, query: Query, places: Sequence[NegativeSample]) -> None:
+    def _sample_aliasing(self, hybrid_map: HybridMap, comparison: OngoingComparison) -> None:
         """Match the keyframes into areas in which they do not lie, once for all hypotheses of an event."""
-        newest = max(query.poses)
+        poses = comparison.query.poses
+        newest = max(poses)
         if newest != self._newest_sampled:
             self._newest_sampled = newest
-            self._aliasing.add_negatives(best_shares(self._grid_cache.grid(query.poses), places, self._settings))
+            elsewhere = [area for area in comparison.elsewhere if hybrid_map.has_area(area)]
+            places = [self._negative_sample(hybrid_map, area, comparison.excluded) for area in elsewhere]
+            self._aliasing.add_negatives(best_shares(self._grid_cache.grid(poses), places, self._settings))
 
     def _negative_sample(self, hybrid_map: HybridMap, area: int, excluded: Collection[int]) -> NegativeSample:
         """An area's grid, and the pose of its middle keyframe."""
@@ -350,42 +377,35 @@ class ClosureSearch:
         settings = self._settings
         if is_wide(candidate.prior.covariance, self._filter):
             settings = replace(settings, min_log_ratio=MIN_LOG_RATIO)
-        modes = match_areas(query, place.grid, candidate.prior, settings, bounds).modes
+        match = match_areas(query, place.grid, candidate.prior, settings, bounds)
+        modes = match.modes
+        self._event_work += match.work
         poses = stack_poses(candidate.unmatched_poses)
         areas = [containing_area(place, se2.compose(mode.pose.mean, poses), radius) for mode in modes]
         if modes and areas[max(range(len(modes)), key=lambda n: modes[n].log_mass)] is None:
             return None
         return [mode for mode, area in zip(modes, areas, strict=True) if area == place.area]
 
-    def _fits(
-        self,
-        hybrid_map: HybridMap,
-        place: AreaPlace,
-        candidate: AreaCandidate,
-        modes: Sequence[MatchMode],
-        entry: EntryPrior,
-        pi: float,
-    ) -> Iterator[Fit]:
+    def _fits(self, hybrid_map: HybridMap, examined: ExaminedArea, pi: float) -> Iterator[Fit]:
         """The weights of a candidate's modes.
 
         The modes share the probability of the place by their masses. A mode farther from the prior's mean than poses in
         the place usually are has less. Where a pending closure already puts the robot there, the fit was to be expected
         even if that closure is false.
 
-        :param entry: prior of the place by itself; ``pi`` is that of the transition model.
+        :param pi: prior of the place in the transition model, beside that by itself.
         """
+        area, prior, entry, modes, agreements, _ = examined
         is_expected = entry.probability > 0.5 and bool(hybrid_map.pending_closures)
-        points = self._grid_cache.grid(candidate.unmatched_poses).points
         log_total_mass = float(np.logaddexp.reduce([mode.log_mass for mode in modes]) if modes else 0.0)
-        for mode in modes:
-            agreement = place.grid.compare(points, mode.pose.mean)
+        for mode, agreement in zip(modes, agreements, strict=True):
             log_evidence = MAP_IN_MAP.log_likelihood_ratio(agreement, MAPS_OUTLIER_RATE)
             log_evidence += self._aliasing.log_distinctiveness(agreement.matched_share, already_expected=is_expected)
-            difference = se2.log(se2.between(candidate.prior.mean, mode.pose.mean))
-            distance = float(difference @ np.linalg.solve(candidate.prior.covariance, difference))
+            difference = se2.log(se2.between(prior.mean, mode.pose.mean))
+            distance = float(difference @ np.linalg.solve(prior.covariance, difference))
             log_offset = -0.5 * max(0.0, distance - entry.median_mahalanobis2)
             log_weight = math.log(pi) + mode.log_mass - log_total_mass + log_evidence + log_offset
-            yield Fit(place.area, mode, log_weight)
+            yield Fit(area, mode, log_weight)
 
 
 def _split_heaviest(fits: Sequence[Fit], count: int) -> tuple[tuple[Fit, ...], tuple[Fit, ...]]:

@@ -129,6 +129,8 @@ class GlobalSearch:
     :ivar unexamined: {area: probability by its appearance} of those that were not searched yet.
     :ivar candidates: what was found.
     :ivar fitting_areas: the areas of the candidates' regions, and those around: a robot drives on.
+    :ivar event_work: work of the last event.
+    :ivar refuted: number of the candidates that were tested in vain.
     """
 
     poses: Mapping[int, Pose]
@@ -137,6 +139,13 @@ class GlobalSearch:
     unexamined: Mapping[int, float]
     candidates: tuple[PoseCandidate, ...] = ()
     fitting_areas: frozenset[int] = frozenset()
+    event_work: int = 0
+    refuted: int = 0
+
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether the work of the last event was done, so that candidates are tested at the next one."""
+        return self.event_work >= _EVENT_WORK
 
     @property
     def best_share(self) -> float:
@@ -192,7 +201,7 @@ def continue_search(
             fitting_areas=search.fitting_areas | (match.around if match.candidates else frozenset()),
         )
         work += match.work
-    return search
+    return replace(search, event_work=work)
 
 
 def localize_globally(
@@ -231,10 +240,14 @@ def is_conclusive(
 ) -> bool:
     """Whether the search is over: all areas were searched, or a candidate is probable in spite of those that were not.
 
+    Candidates that were tested in vain wait for another one, or for the end of the search.
+
     :param probability: of such a candidate, before walls count against it.
     """
     if not search.unexamined:
         return True
+    if len(search.candidates) <= search.refuted:
+        return False
     log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint)
     return bool(_probabilities(log_weights, log_rest).max(initial=0.0) >= probability)
 

@@ -79,7 +79,7 @@ those in free space count against a match: so also matches are dropped whose sha
 _MAX_MATCHES = 40
 """Most matches per region."""
 
-_CELL_WORK = 20
+CELL_WORK = 20
 """Work of a cell of a region's map, which may have to be built: in the time of so many samples."""
 
 
@@ -289,7 +289,7 @@ class GlobalScanMatcher:
         constraint = constrain_around(positions, is_searched, stack_poses(poses)[:, :2], self._radius, surface.cell)
         bounds = query_bounds(positions[is_searched], query, poses, self._radius)
         cells = find_cells(sparse, surface, _NO_POINTS, _FLAT, settings, bounds, constraint)
-        work = cells.work + _CELL_WORK * surface.log_ratio.size
+        work = cells.work + CELL_WORK * surface.log_ratio.size
         if not cells.score.size:
             return [], work
         place = AreaPlace(NO_AREA, keyframe_areas, positions, self._grid_cache.grid(known))

@@ -15,6 +15,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, AreaPair, HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
+from hmt_slam_ros.topological_inference.area_comparison import OngoingComparison
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseHint
 
 Covariance = Float64
@@ -182,6 +183,7 @@ class HypothesisState:
     :ivar local_area_poses: {area: ``current_T_area``} of the areas in the submap besides the robot's own.
     :ivar unmatched_keyframes: those of them that no re-check has compared.
     :ivar pending_candidates: known areas beside which the newest of them fitted, and which the robot may enter soon.
+    :ivar comparison: of some of them with known areas, while it goes on; else None.
     :ivar unlinked_overlap: the area of the submap in whose place the robot is, if no arc joins it to the robot's own,
         and for how many keyframe events in a row; or None.
     :ivar kidnapping_evidence: {keyframe event: CUSUM increment, nats} of the latest events since the robot may have
@@ -195,6 +197,7 @@ class HypothesisState:
     local_area_poses: Mapping[int, Float64] = field(default_factory=dict)
     unmatched_keyframes: tuple[int, ...] = ()
     pending_candidates: tuple[int, ...] = ()
+    comparison: OngoingComparison | None = None
     unlinked_overlap: tuple[int, int] | None = None
     kidnapping_evidence: Mapping[int, float] = field(default_factory=dict)
     unstored_poses: Mapping[int, PoseInArea] = field(default_factory=dict)
@@ -248,17 +251,19 @@ class HypothesisState:
     def after_matching(
         self, areas: Sequence[int], keyframes: Sequence[int], pending: tuple[int, ...] = (), *, all_areas: bool = True
     ) -> HypothesisState:
-        """The state after keyframes were compared with known areas.
+        """The state after keyframes were compared with known areas. Keyframes that came since are without a match.
 
         :param pending: other areas, beside which they fitted.
         :param all_areas: whether they were compared with all candidates.
         """
+        newer = tuple(k for k in self.unmatched_keyframes if k > max(keyframes, default=math.inf))
         added = {area: self.matched_keyframes.get(area, frozenset()) | set(keyframes) for area in areas}
         return replace(
             self,
             matched_keyframes={**self.matched_keyframes, **added},
-            unmatched_keyframes=() if all_areas else self.unmatched_keyframes,
+            unmatched_keyframes=newer if all_areas else self.unmatched_keyframes,
             pending_candidates=pending,
+            comparison=None,
         )
 
     def after_overlap(self, area: int | None) -> HypothesisState:

@@ -33,14 +33,13 @@ from hmt_slam_ros.topological_inference.branching import (
     BranchingState,
     Child,
     Parent,
-    apply_revision,
-    merge_areas,
 )
 from hmt_slam_ros.topological_inference.global_localization import (
     LocalizationStatus,
     PoseDistribution,
     summarize_localization,
 )
+from hmt_slam_ros.topological_inference.hypothesis_changes import apply_revision, merge_areas
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     HypothesisState,
     LocalizedHypothesis,
@@ -198,7 +197,11 @@ class Tsbi:
         by_hypothesis = {event.hypothesis: event for event in events.events}
         keyframe = self._keyframe
         parents = self._parents(keyframe)
-        branches = [self._branch(parent, by_hypothesis.get(parent.hypothesis), keyframe) for parent in parents]
+        branched = {
+            parent.hypothesis: self._branch(parent, by_hypothesis.get(parent.hypothesis), keyframe)
+            for parent in _in_turn(parents, events.sequence)
+        }
+        branches = [branched[parent.hypothesis] for parent in parents]
         children = [child for branch in branches for child in branch.children]
         distributions = (branch.pose_distribution for branch in branches)
         self._pose_distribution = next((d for d in distributions if d is not None), self._pose_distribution)
@@ -211,7 +214,8 @@ class Tsbi:
         revised = self._state.revised_hypotheses
         is_reset = keyframe.motion_unknown or keyframe.initial_pose is not None
         is_moved = any(hypothesis.moved_keyframes for hypothesis in hypotheses)
-        pruned = () if revised or is_reset or is_moved else events.redundant_keyframes
+        is_waiting = bool(events.events) and any(child.state.comparison is not None for child in survivors)
+        pruned = () if revised or is_reset or is_moved or is_waiting else events.redundant_keyframes
         stale_beams = () if revised or is_reset else keyframe.stale_beams
         answer = Hypotheses(events.sequence, tuple(hypotheses), reduced.unexamined, pruned, stale_beams)
         self._replica.apply_hypotheses(answer)
@@ -310,6 +314,9 @@ class Tsbi:
             return self._branching.cut(parent, event.keyframes)
         if event.into is not None:
             return Branches([merge_areas(parent, event.area, event.into, self._branching.search)])
+        if parent.state.comparison is not None:
+            # Area abstraction repeats the move.
+            return self._branching.continue_comparison(parent, parent.state.comparison)
         return self._branching.move(parent, event.area)
 
     def _branch_without_area_event(self, parent: Parent, estimate: HypothesisEstimate, keyframe: Keyframe) -> Branches:
@@ -322,9 +329,14 @@ class Tsbi:
             return self._branching.link(parent, state.unlinked_overlap[0], keyframe.scan, estimate.pose)
         unmatched = len(state.unmatched_keyframes)
         is_recheck_due = unmatched >= self._options.recheck_keyframes
+        if state.comparison is not None:
+            # A search and a comparison that both go on take turns.
+            is_recheck_due = keyframe.sequence % 2 == 0
         if is_search_due(parent, self._options) or (is_searching(parent) and not is_recheck_due):
             branches = update_relocalization(self._branching, parent)
             return branches if keyframe.mapping else accept_relocalization(branches)
+        if state.comparison is not None:
+            return self._branching.continue_comparison(parent, state.comparison)
         if is_recheck_due:
             return self._branching.recheck(parent)
         if state.pending_candidates and unmatched == _RETRY_KEYFRAMES:
@@ -410,3 +422,11 @@ class Tsbi:
             hypothesis_states={decision.hypothesis: self._state.hypothesis_states[decision.hypothesis]},
             unexamined=0.0,
         )
+
+
+def _in_turn(parents: Sequence[Parent], sequence: int) -> Sequence[Parent]:
+    """The order in which hypotheses use the work of an event: while a comparison goes on, each is first in turn."""
+    if all(parent.state.comparison is None for parent in parents):
+        return parents
+    first = sequence % len(parents)
+    return [*parents[first:], *parents[:first]]

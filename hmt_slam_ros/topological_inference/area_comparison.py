@@ -1,0 +1,84 @@
+"""The comparison of keyframes with known areas, area by area, which goes on from event to event."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.registration.area_to_area import MatchMode
+from hmt_slam_ros.registration.consistency import Agreement
+from hmt_slam_ros.topological_inference.candidate_gating import AreaCandidate, EntryPrior, Query, Transition
+
+ComparisonKind = Literal["cut", "recheck", "retry"]
+
+
+class Fit(NamedTuple):
+    """One way in which the keyframes lie in a known area.
+
+    :ivar log_weight: log pi p(z), p(z) relative to new ground, nats. The appearance of the place adds nothing to the
+        evidence of its surfaces (`python -m benchmark evidence`).
+    """
+
+    area: int
+    mode: MatchMode
+    log_weight: float
+
+
+class AreaComparison(NamedTuple):
+    """The comparison of keyframes with the known areas.
+
+    :ivar transition: pi of the known areas and of new ground.
+    :ivar fits: the heaviest modes in each examined area.
+    :ivar examined_areas: those areas.
+    :ivar pending_candidates: areas beside whose place the keyframes fit; they are not in it yet, so they were not
+        examined.
+    :ivar skipped_weight: weight of the other areas and modes, on the scale of ``exp(Fit.log_weight)``.
+    """
+
+    transition: Transition
+    fits: tuple[Fit, ...]
+    examined_areas: tuple[int, ...]
+    pending_candidates: tuple[int, ...]
+    skipped_weight: float
+
+
+class ExaminedArea(NamedTuple):
+    """A known area with which the keyframes were compared.
+
+    :ivar prior: belief over ``area_T_reference`` by the arcs.
+    :ivar entry: whether they lie in its place, by the arcs.
+    :ivar modes: the ways in which they lie in it.
+    :ivar agreements: of their surfaces with the area's map, one for each mode.
+    :ivar is_pending: whether they fit best beside its place.
+    """
+
+    area: int
+    prior: PoseGaussian
+    entry: EntryPrior
+    modes: tuple[MatchMode, ...] = ()
+    agreements: tuple[Agreement, ...] = ()
+    is_pending: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class OngoingComparison:
+    """A comparison of keyframes with known areas before its end.
+
+    :ivar query: the keyframes, in the robot's area.
+    :ivar excluded: areas that are neither candidates nor part of a candidate's map.
+    :ivar kind: of a cut, of a recheck with all areas that the arcs admit, or of a retry with some of them.
+    :ivar candidates: {area: its prior} of those that were not examined yet, the most probable first.
+    :ivar skipped: {area: bound on its probability} of those that are not examined.
+    :ivar elsewhere: some areas in which the keyframes surely do not lie.
+    :ivar examined: what was found in the others.
+    """
+
+    query: Query
+    excluded: frozenset[int]
+    kind: ComparisonKind
+    candidates: Mapping[int, AreaCandidate]
+    skipped: Mapping[int, float]
+    elsewhere: tuple[int, ...]
+    examined: tuple[ExaminedArea, ...] = ()
