@@ -145,7 +145,6 @@ def measure_weighing(settings: Settings) -> Report:
         records = _map(settings, cases)
         _add(report, "Simulated worlds", cases, records)
         report.pictures["filter_evidence.png"] = CAPTION
-        report.illustrations = ("filter_evidence.png",)
         plot_evidence(settings.out / "filter_evidence.png", records[IN_USE])
     if logs := [name for name in chosen if name in RECORDED and not settings.training]:
         with open_logs(logs) as opened:
