@@ -28,7 +28,8 @@ from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.topological_inference.area_comparison import ComparisonKind, OngoingComparison
-from hmt_slam_ros.topological_inference.branching import Branching, Child, Parent
+from hmt_slam_ros.topological_inference.branches import Child, Parent
+from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.candidate_gating import AreaCandidate, Query
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState

@@ -12,7 +12,8 @@ from hmt_slam_ros.offline.runtime import LockStep
 from hmt_slam_ros.process_table import PROCESSES
 from hmt_slam_ros.results.recorder import Recorder
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.topological_inference.branching import Branches, Branching, Child
+from hmt_slam_ros.topological_inference.branches import Branches, Child
+from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 SIGMA = np.diag([0.05, 0.05, np.radians(0.5)]) ** 2

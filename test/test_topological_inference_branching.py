@@ -11,9 +11,11 @@ from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.topological_inference.branching import Branching, Parent
-from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
+from hmt_slam_ros.topological_inference.branches import Parent
+from hmt_slam_ros.topological_inference.branching import Branching
+from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState, Lost
 
 PATH = np.array([[1.2 + 0.5 * k, 2.2, 0.1 * math.sin(k)] for k in range(6)])
 ROOM = np.concatenate((box(0.0, 0.0, 5.0, 5.0), box(1.0, 3.0, 2.0, 3.5)))
@@ -186,6 +188,36 @@ def test_keyframes_of_a_wide_pose_are_tracked_in_no_area_and_compared_with_those
     assert {child.area for child in branching.cut(uncertain, newest).children} == {0, parent.area + 1}
 
 
+def behind_a_wide_arc(covariance):
+    """The child on new ground of a robot in area 1, whose pose in that area is as uncertain; area 0 is far."""
+    parent, branching, newest = rooms_apart((OTHER, ROOM), ((40.0, 0.0),), 0.1)
+    parent = replace(parent, state=replace(parent.state, covariances=dict.fromkeys(newest, np.diag(covariance) ** 2)))
+    (child,) = branching.cut(parent, newest[2:]).children
+    return parent, child
+
+
+def test_behind_a_wide_arc_the_robot_is_searched_in_the_map_of_before():
+    parent, child = behind_a_wide_arc((0.1, 0.1, 0.7))
+    assert child.area == 2
+    lost = child.state.localization
+    assert (lost.since, lost.tracked_pose.area, lost.tracked_pose.keyframe) == (8, 1, 8)
+    np.testing.assert_array_equal(lost.tracked_pose.pose, parent.hybrid_map.keyframes(1)[8])
+    assert lost.counted_evidence is None
+    (arc,) = child.arcs
+    assert 0.7 < np.sqrt(arc.pose.covariance[2, 2]) < 0.72  # not uninformative
+    _, certain = behind_a_wide_arc((0.1, 0.1, 0.1))
+    assert not certain.state.is_lost
+
+
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_where_a_lost_robot_is_searched_its_keyframes_are_not_compared(is_lost):
+    parent, branching, newest = rooms_apart((ROOM, ROOM), ((0.6, -0.4),), 1.0)
+    if is_lost:
+        parent = replace(parent, state=replace(parent.state, localization=Lost(newest[0])))
+    found = branching.cut(parent, newest[1:]).children
+    assert {child.area for child in found} == ({2} if is_lost else {0, 2})
+
+
 def test_a_recheck_of_pending_candidates_compares_the_newest_keyframes():
     parent, branching, _ = approaching((6.2, 5.6, 5.0, 4.4, 3.8, 3.2))
     parent = replace(parent, state=replace(parent.state, unmatched_keyframes=(), pending_candidates=(0,)))
@@ -269,3 +301,43 @@ def test_an_improbable_hypothesis_examines_few_areas_and_counts_the_others():
         examined[share] = {area for child in branches.children for area in child.state.matched_keyframes}
         assert (branches.log_skipped_weight > -math.inf) == (share < 1.0)
     assert (len(examined[1.0]), len(examined[1e-3])) == (6, 4)
+
+
+def cut_in_promised_place(rooms, sigma=0.1, cut=2, **state):
+    """The children of a robot that arcs put in the place of area 0."""
+    parent, branching, newest = rooms_apart(rooms, ((0.2, 0.1),), sigma)
+    parent = replace(parent, state=replace(parent.state, **state))
+    return branching.cut(parent, newest[cut:]).children
+
+
+def test_where_nothing_fits_in_a_promised_place_the_arcs_may_be_wrong():
+    new, suspected = cut_in_promised_place((OTHER, ROOM))
+    assert math.exp(new.log_weight) == pytest.approx(0.05)  # new ground beside the place
+    assert math.exp(suspected.log_weight) == pytest.approx(0.01)
+    (arc,) = suspected.arcs
+    assert is_uninformative(arc.pose)
+    assert suspected.state.localization.since == 8
+    assert not new.state.is_lost
+
+
+@pytest.mark.parametrize(
+    ("rooms", "settings"),
+    [
+        ((ROOM, ROOM), {}),
+        ((OTHER, ROOM), {"sigma": 6.0}),
+        ((OTHER, ROOM), {"localization": Lost(6)}),
+        ((OTHER, ROOM), {"cut": 0}),
+    ],
+    ids=["it fits", "nothing is promised", "lost already", "an area would be left empty"],
+)
+def test_else_the_arcs_are_not_suspected(rooms, settings):
+    children = cut_in_promised_place(rooms, **settings)
+    assert not any(is_uninformative(arc.pose) for child in children for arc in child.arcs)
+
+
+def test_a_recheck_suspects_the_arcs_of_a_promised_place_too():
+    parent, branching, newest = rooms_apart((OTHER, OTHER, ROOM), ((0.2, 0.1), (2.0, 0.0)), 0.1)
+    known_through_another(parent.hybrid_map)
+    parent = replace(parent, state=replace(parent.state, unmatched_keyframes=tuple(newest[1:])))
+    arcs = [arc for child in branching.recheck(parent).children for arc in child.arcs]
+    assert [is_uninformative(arc.pose) for arc in arcs] == [True]

@@ -17,7 +17,8 @@ from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.topological_inference import branching as module
 from hmt_slam_ros.topological_inference.area_comparison import AreaComparison, Fit, OngoingComparison
-from hmt_slam_ros.topological_inference.branching import Branching, Parent
+from hmt_slam_ros.topological_inference.branches import Parent
+from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.candidate_gating import Transition
 from hmt_slam_ros.topological_inference.closure_search import _split_heaviest
 from hmt_slam_ros.topological_inference.hypothesis_changes import apply_revision, merge_areas
@@ -266,7 +267,7 @@ def test_keyframes_are_cut_at_the_event_of_their_last_comparison_together_with_n
 
 @pytest.mark.parametrize(("kind", "compared"), [("recheck", [12, 13]), ("cut", [11, 12])])
 def test_a_cut_waits_for_the_comparison_of_others(kind, compared):
-    given = GivenComparison(AreaComparison(Transition({}, 1.0), (), (6,), (), 0.0), 2)
+    given = GivenComparison(AreaComparison(Transition({6: 0.1}, 1.0), (), (6,), (), 0.0), 2)
     branching, parent = given.branching(), make_parent()
     ongoing = OngoingComparison(branching.query(parent, compared), frozenset({1}), kind, {}, {}, ())
     parent = replace(parent, state=replace(parent.state, comparison=ongoing))

@@ -16,7 +16,7 @@ from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.topological_inference import global_localization, kidnapping, relocalization
-from hmt_slam_ros.topological_inference.branching import Branches, Parent
+from hmt_slam_ros.topological_inference.branches import Branches, Parent
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseDistribution, PoseHint
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
 from hmt_slam_ros.topological_inference.hypothesis_tree import (

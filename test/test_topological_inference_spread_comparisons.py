@@ -15,7 +15,7 @@ from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter
 from hmt_slam_ros.topological_inference import closure_search
 from hmt_slam_ros.topological_inference import tsbi as module
-from hmt_slam_ros.topological_inference.branching import Branches, Parent
+from hmt_slam_ros.topological_inference.branches import Branches, Parent
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState, Lost, Tracking
 from hmt_slam_ros.topological_inference.tsbi import Tsbi, TsbiState
 

@@ -24,7 +24,8 @@ from hmt_slam_ros.registration.match_modes import log_ratio_at
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.topological_inference.area_comparison import AreaComparison, Fit, OngoingComparison
-from hmt_slam_ros.topological_inference.branching import Branches, Branching, Parent
+from hmt_slam_ros.topological_inference.branches import Branches, Parent
+from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.candidate_gating import Query, entry_prior
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 from hmt_slam_ros.topological_inference.place_recognition import ScanDescriptors, descriptor_log_ratio

@@ -41,7 +41,8 @@ from hmt_slam_ros.submap.local_filter import FilterStep, LocalFilter
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.particle_filter import ParticleFilter, ParticleFilters, _GroupProposals
 from hmt_slam_ros.submap.pose_modes import log_sum
-from hmt_slam_ros.topological_inference.branching import Branching, Parent
+from hmt_slam_ros.topological_inference.branches import Parent
+from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 Entry = dict[str, Any]

@@ -17,8 +17,10 @@ ComparisonKind = Literal["cut", "recheck", "retry"]
 class Fit(NamedTuple):
     """One way in which the keyframes lie in a known area.
 
+    :ivar area: the known area.
+    :ivar mode: of their match with it.
     :ivar log_weight: log pi p(z), p(z) relative to new ground, nats. The appearance of the place adds nothing to the
-        evidence of its surfaces (`python -m benchmark evidence`).
+        evidence of its surfaces (docs/decisions/0019-appearance-for-retrieval.md).
     """
 
     area: int
@@ -47,6 +49,7 @@ class AreaComparison(NamedTuple):
 class ExaminedArea(NamedTuple):
     """A known area with which the keyframes were compared.
 
+    :ivar area: the known area.
     :ivar prior: belief over ``area_T_reference`` by the arcs.
     :ivar entry: whether they lie in its place, by the arcs.
     :ivar modes: the ways in which they lie in it.

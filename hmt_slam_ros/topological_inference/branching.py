@@ -11,7 +11,6 @@ import math
 from collections import ChainMap
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,12 +19,15 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import connected_neighbors, informative_arc, shortest_path_beliefs
+from hmt_slam_ros.hybrid_map.shortest_path import (
+    connected_neighbors,
+    informative_arc,
+    shortest_path_beliefs,
+    uninformative_belief,
+)
 from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions, min_distance
-from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, AreaMerge, MovedKeyframe
+from hmt_slam_ros.messages.map_changes import Arc, MovedKeyframe
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
-from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.relative_motion import is_wide
 from hmt_slam_ros.topological_inference.area_comparison import (
@@ -34,6 +36,7 @@ from hmt_slam_ros.topological_inference.area_comparison import (
     Fit,
     OngoingComparison,
 )
+from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.candidate_gating import Query
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, SearchState
 from hmt_slam_ros.topological_inference.global_localization import (
@@ -42,7 +45,12 @@ from hmt_slam_ros.topological_inference.global_localization import (
     PoseDistribution,
     PoseHint,
 )
-from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState, Lost, relative_covariance
+from hmt_slam_ros.topological_inference.hypothesis_tree import (
+    Lost,
+    PoseInArea,
+    Tracking,
+    relative_covariance,
+)
 
 MIN_PROPOSAL_PROBABILITY = 0.5
 """Smallest probability of a hypothesis for which landmarks propose loops."""
@@ -53,73 +61,17 @@ MIN_EXAMINED_AREAS = 4
 From docs/decisions/0021-bounded-cost-of-a-cut.md.
 """
 
+_PROMISED_PROBABILITY = 0.8
+"""Probability of a known place by the arcs, from which keyframes that fit nothing there make the arcs suspected.
+
+From docs/decisions/0055-suspected-arcs.md.
+"""
+
+_ARC_FAULT_PROBABILITY = 0.01
+"""Prior probability that the arcs to a promised place are wrong (docs/decisions/0055-suspected-arcs.md)."""
+
 _UNCONFIRMED_INFLATION = 100.0
 """Factor on the covariance of an arc along other arcs that no match confirms: it adds next to nothing to those."""
-
-
-@dataclass(frozen=True, eq=False)
-class Parent:
-    """A hypothesis before the event.
-
-    :ivar log_weight: log of its probability, the newest scan's evidence included.
-    :ivar probability: its probability before, in proportion to which it may examine areas.
-    :ivar clutter: usual rate of contradictions of its map.
-    """
-
-    hypothesis: int
-    area: int
-    hybrid_map: HybridMap
-    state: HypothesisState
-    log_weight: float
-    probability: float = 1.0
-    clutter: Clutter = NO_CLUTTER
-
-    def local_area_poses(self) -> dict[int, Float64]:
-        """{area: ``area_T_other``} of the submap's other areas."""
-        return {area: pose for area, pose in self.state.local_area_poses.items() if self.hybrid_map.has_area(area)}
-
-    def covariance(self, keyframe: int) -> Float64:
-        """The covariance of a keyframe's pose in the robot's area, shape (3, 3)."""
-        return self.state.covariances.get(keyframe, np.zeros((3, 3)))
-
-    def unchanged_child(self, state: HypothesisState | None = None) -> Child:
-        """The child with the robot in the same area of the same map, and with this state, if one is given."""
-        return Child(self.hypothesis, self.log_weight, self.area, state or self.state)
-
-
-@dataclass(frozen=True, eq=False)
-class Child:
-    """One continuation of a hypothesis.
-
-    :ivar parent: id of the hypothesis that it continues.
-    :ivar log_weight: log of its weight, unnormalized.
-    :ivar reload_local_map: whether the submap has to be loaded again.
-    """
-
-    parent: int
-    log_weight: float
-    area: int
-    state: HypothesisState
-    frame_change: PoseGaussian | None = None
-    moved_keyframes: tuple[MovedKeyframe, ...] = ()
-    arcs: tuple[Arc, ...] = ()
-    reload_local_map: bool = False
-    removed_arcs: tuple[ArcEnds, ...] = ()
-    area_merge: AreaMerge | None = None
-
-
-class Branches(NamedTuple):
-    """All continuations of one hypothesis.
-
-    :ivar closures_searched: whether known areas were searched.
-    :ivar log_skipped_weight: log of the weight of those that were not examined.
-    :ivar pose_distribution: of a lost robot in the map, if it was searched.
-    """
-
-    children: list[Child]
-    closures_searched: bool = False
-    log_skipped_weight: float = -math.inf
-    pose_distribution: PoseDistribution | None = None
 
 
 @dataclass(frozen=True)
@@ -281,6 +233,7 @@ class Branching:
         parent = replace(parent, state=state)
         children = [self._enter_new(parent, query, math.log(found.transition.new))]
         children += [self._enter_known(parent, query, fit) for fit in found.fits]
+        children += self._suspect_arcs(parent, query, found)
         return Branches(children, True, _log(found.skipped_weight) + parent.log_weight)
 
     def recheck(self, parent: Parent, only: Collection[int] = ()) -> Branches:
@@ -318,6 +271,7 @@ class Branching:
         log_new = 0.0 if is_retry and not fits else math.log(found.transition.new)
         stay = replace(parent.unchanged_child(), log_weight=parent.log_weight + log_new)
         children = [stay, *(self._join(parent, comparison.query, fit) for fit in fits)]
+        children += self._suspect_arcs(parent, comparison.query, found)
         return Branches(children, True, _log(found.skipped_weight) + parent.log_weight)
 
     @staticmethod
@@ -352,6 +306,7 @@ class Branching:
         only: Collection[int] = (),
     ) -> OngoingComparison:
         """The comparison with known areas, more of them the more probable the hypothesis is."""
+        excluded = {*excluded, *_searched_areas(parent)}
         most = min(
             self.options.max_candidates,
             max(MIN_EXAMINED_AREAS, math.ceil(self.options.max_comparisons * parent.probability)),
@@ -422,7 +377,26 @@ class Branching:
     def _enter_new(self, parent: Parent, query: Query, log_factor: float) -> Child:
         """New ground: the reference keyframe becomes the frame of a new area."""
         origin = PoseGaussian.from_pose(np.zeros(3))
-        return self.enter_area(parent, query, self.new_area(parent, query), origin, query.belief, log_factor)
+        child = self.enter_area(parent, query, self.new_area(parent, query), origin, query.belief, log_factor)
+        # Behind so wide an arc, gates admit all places, and a search of the whole map costs less than comparisons.
+        is_lost = not child.state.is_lost and is_wide(query.belief.covariance, self._filter)
+        return _lose(child, parent, query) if is_lost else child
+
+    def _suspect_arcs(self, parent: Parent, query: Query, found: AreaComparison) -> list[Child]:
+        """The child in which the arcs are wrong, where they promise a known place and nothing fits there; or none.
+
+        The ground of that place was mapped twice then, and the two do not agree. The robot may be anywhere.
+        """
+        promised = sum(found.transition.known[area] for area in found.examined_areas)
+        own = sorted(parent.hybrid_map.keyframes(parent.area))
+        keyframes = [k for k in own if k >= min(query.poses)]
+        if found.fits or promised < _PROMISED_PROBABILITY or parent.state.is_lost or keyframes == own:
+            return []
+        query = self.query(parent, keyframes)
+        origin, arc = PoseGaussian.from_pose(np.zeros(3)), uninformative_belief(query.belief.mean)
+        log_fault = math.log(_ARC_FAULT_PROBABILITY)
+        child = self.enter_area(parent, query, self.new_area(parent, query), origin, arc, log_fault)
+        return [_lose(child, parent, query)]
 
     def new_area(self, parent: Parent, query: Query) -> int:
         """The number of an area that keyframes begin, the same for all hypotheses of an event."""
@@ -494,7 +468,24 @@ class Branching:
         """The robot in its area, which an arc now joins to a known one."""
         arc = Arc(parent.area, fit.area, query.belief.compose(fit.mode.measured.inverse()), closure=True)
         log_weight = parent.log_weight + fit.log_weight
-        return replace(parent.unchanged_child(), log_weight=log_weight, arcs=(arc,), reload_local_map=True)
+        is_found = fit.area in _searched_areas(parent)
+        state = replace(parent.state, localization=Tracking()) if is_found else parent.state
+        return replace(parent.unchanged_child(state), log_weight=log_weight, arcs=(arc,), reload_local_map=True)
+
+
+def _lose(child: Child, parent: Parent, query: Query) -> Child:
+    """The child, whose keyframes are searched in the map of before."""
+    first = next(iter(query.poses))
+    lost = Lost(first, tracked_pose=PoseInArea(parent.area, first, query.belief.mean), counted_evidence=None)
+    return replace(child, state=replace(child.state, localization=lost))
+
+
+def _searched_areas(parent: Parent) -> list[int]:
+    """The areas from before a robot was lost, in which it is searched: they are not compared with its keyframes."""
+    lost, hybrid_map = parent.state.localization, parent.hybrid_map
+    if not isinstance(lost, Lost):
+        return []
+    return [a for a in hybrid_map.area_ids() if min(hybrid_map.keyframes(a), default=lost.since) < lost.since]
 
 
 def _make_arc(parent: Parent, area: int, belief: PoseGaussian) -> Arc:

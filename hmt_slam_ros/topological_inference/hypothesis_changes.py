@@ -9,7 +9,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import AreaMerge, MovedKeyframe
 from hmt_slam_ros.messages.messages import Hypothesis
-from hmt_slam_ros.topological_inference.branching import Child, Parent
+from hmt_slam_ros.topological_inference.branches import Child, Parent
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
 

@@ -17,6 +17,7 @@ from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, AreaPair, HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.topological_inference.area_comparison import OngoingComparison
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseHint
+from hmt_slam_ros.topological_inference.surroundings_change import Surroundings
 
 Covariance = Float64
 
@@ -143,7 +144,7 @@ class Tracking:
 
 @dataclass(frozen=True, eq=False)
 class Lost:
-    """The robot may be anywhere, until it is relocalized.
+    """The robot may be anywhere in the map of before, until it is relocalized.
 
     :ivar since: the first keyframe after the robot was lost.
     :ivar false_alarm: the alternative to a kidnapping, in localization; else None.
@@ -154,8 +155,8 @@ class Lost:
     :ivar search: of the map, while it goes on; else None.
     :ivar searched: the newest keyframe of the last search, -1 before the first.
     :ivar unknown: the newest keyframe of those that are on unmapped ground for certain, -1 for none.
-    :ivar counted_evidence: log Bayes factor for a pose elsewhere that is in the hypothesis's weight, nats; None after
-        a relocalized hypothesis was split off.
+    :ivar counted_evidence: log Bayes factor for a pose elsewhere that is in the hypothesis's weight, nats; None behind
+        a wide arc, and after a relocalized hypothesis was split off.
     :ivar kind: distinguishes it from ``Tracking`` in a document.
     """
 
@@ -188,6 +189,7 @@ class HypothesisState:
         and for how many keyframe events in a row; or None.
     :ivar kidnapping_evidence: {keyframe event: CUSUM increment, nats} of the latest events since the robot may have
         been kidnapped.
+    :ivar surroundings: what explains the contradictions if the robot was not kidnapped.
     :ivar unstored_poses: {event of these: the robot's pose} of scans that the map does not hold.
     :ivar localization: tracking, or lost.
     """
@@ -200,6 +202,7 @@ class HypothesisState:
     comparison: OngoingComparison | None = None
     unlinked_overlap: tuple[int, int] | None = None
     kidnapping_evidence: Mapping[int, float] = field(default_factory=dict)
+    surroundings: Surroundings = field(default_factory=Surroundings)
     unstored_poses: Mapping[int, PoseInArea] = field(default_factory=dict)
     localization: Tracking | Lost = field(default_factory=Tracking)
 
@@ -209,24 +212,27 @@ class HypothesisState:
         return isinstance(self.localization, Lost)
 
     def after_scan(
-        self, event: int, log_kidnapping_ratio: float, unstored_pose: PoseInArea | None = None
+        self, event: int, log_ends: float, log_walls: float, unstored_pose: PoseInArea | None = None
     ) -> HypothesisState:
         """The state after the scan of a keyframe event.
 
-        :param log_kidnapping_ratio: log p(scan | kidnapped before it) / p(scan | not kidnapped), by the submap, nats.
+        :param log_ends: log-likelihood ratio of the ends of its beams in the submap, "not kidnapped" to "kidnapped",
+            nats.
+        :param log_walls: that of the walls of the submap that they hit or pass.
         :param unstored_pose: the robot's pose, if the map does not hold the scan.
         """
-        increment = log_kidnapping_ratio - _CUSUM_DRIFT
+        surroundings = self.surroundings.update(log_ends, log_walls)
+        increment = -surroundings.log_likelihood - _CUSUM_DRIFT
         evidence = {k: nats for k, nats in self.kidnapping_evidence.items() if k > event - _CUSUM_WINDOW}
         if evidence or increment > 0.0:
             evidence[event] = increment
         if sum(evidence.values()) <= 0.0:
             evidence = {}
         if not evidence and not self.kidnapping_evidence:
-            return self
+            return replace(self, surroundings=surroundings)
         poses = self.unstored_poses if unstored_pose is None else {**self.unstored_poses, event: unstored_pose}
         unstored_poses = {k: pose for k, pose in poses.items() if k in evidence}
-        return replace(self, kidnapping_evidence=evidence, unstored_poses=unstored_poses)
+        return replace(self, kidnapping_evidence=evidence, surroundings=surroundings, unstored_poses=unstored_poses)
 
     def kidnapping_test(self, prior: float) -> tuple[float, int]:
         """Log-odds of a recent kidnapping, and the first keyframe event after it (CUSUM test, Page 1954).
@@ -278,6 +284,7 @@ class HypothesisState:
             covariances,
             {area: keyframes for area, keyframes in matched.items() if keyframes},
             kidnapping_evidence=self.kidnapping_evidence,
+            surroundings=self.surroundings,
             unstored_poses=self.unstored_poses,
             localization=self.localization if isinstance(self.localization, Lost) else Tracking(),
         )

@@ -15,7 +15,8 @@ import numpy as np
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs, uninformative_belief
-from hmt_slam_ros.topological_inference.branching import Branches, Branching, Child, Parent
+from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
+from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, Lost, PoseInArea
 from hmt_slam_ros.topological_inference.relocalization import (
     KIDNAPPED_UNMAPPED_PRIOR,
@@ -23,6 +24,7 @@ from hmt_slam_ros.topological_inference.relocalization import (
     log_bayes_factor,
     prefers_tracked_pose,
 )
+from hmt_slam_ros.topological_inference.surroundings_change import Surroundings
 
 _MIN_KIDNAPPED_PROBABILITY = 0.05
 """Smallest probability of a hypothesis that spawns a kidnapped child."""
@@ -103,4 +105,5 @@ def _kidnapped_child(branching: Branching, parent: Parent, keyframes: Sequence[i
         lost = replace(lost, candidate=candidate, fitting_areas=fitting_areas, searched=max(query.poses))
     else:
         lost = replace(lost, search=search)
-    return replace(child, state=replace(child.state, kidnapping_evidence={}, localization=lost))
+    state = replace(child.state, kidnapping_evidence={}, surroundings=Surroundings(), localization=lost)
+    return replace(child, state=state)

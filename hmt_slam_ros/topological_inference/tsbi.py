@@ -27,13 +27,8 @@ from hmt_slam_ros.messages.messages import (
 )
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, GlobalPoses, Replica, ReplicaState
 from hmt_slam_ros.random_streams import Purpose, random_stream
-from hmt_slam_ros.topological_inference.branching import (
-    Branches,
-    Branching,
-    BranchingState,
-    Child,
-    Parent,
-)
+from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
+from hmt_slam_ros.topological_inference.branching import Branching, BranchingState
 from hmt_slam_ros.topological_inference.global_localization import (
     LocalizationStatus,
     PoseDistribution,
@@ -178,7 +173,8 @@ class Tsbi:
             if not keyframe.mapping and not estimate.stored:
                 unstored_pose = PoseInArea(estimate.area, keyframe.sequence, estimate.pose.mean)
             state = states[estimate.hypothesis]
-            state = state.after_scan(keyframe.sequence, estimate.log_kidnapping_ratio, unstored_pose)
+            log_walls = -estimate.log_kidnapping_ratio - estimate.log_evidence
+            state = state.after_scan(keyframe.sequence, estimate.log_evidence, log_walls, unstored_pose)
             if estimate.stored:
                 state = state.after_keyframe(keyframe.sequence, estimate.pose.covariance)
             states[estimate.hypothesis] = state
@@ -247,13 +243,14 @@ class Tsbi:
     def _parent(self, hypothesis: int) -> Parent:
         estimate = self._estimates[hypothesis]
         probability = self._replica.probabilities[hypothesis]
+        state = self._state.hypothesis_states[hypothesis]
         # A kidnapping is tested by the walls that beams pass as well.
-        log_evidence = -estimate.log_kidnapping_ratio if self._is_kidnapped else estimate.log_evidence
+        log_evidence = state.surroundings.log_likelihood if self._is_kidnapped else estimate.log_evidence
         return Parent(
             hypothesis,
             self._replica.robot_areas[hypothesis],
             self._replica.maps[hypothesis],
-            self._state.hypothesis_states[hypothesis],
+            state,
             math.log(max(probability, _MIN_PROBABILITY)) + log_evidence,
             probability,
             estimate.clutter,
