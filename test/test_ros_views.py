@@ -102,7 +102,8 @@ def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(li
     assert {len(message.poses) for message in particles} == {12}
     assert {message.header.frame_id for message in poses} == {"map"}
     assert {"area_0", "area_1", "area_2"} <= {message.header.frame_id for message in local_poses}
-    assert min(len(poses), len(local_poses)) > 100
+    # At full speed a slow reader gets the last 100 messages of a stream, about.
+    assert min(len(poses), len(local_poses)) > 90
     assert_health(health)
     if transforms is not None:
         pairs = {(t.header.frame_id, t.child_frame_id) for message in transforms for t in message.transforms}
