@@ -12,26 +12,38 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.registration.branch_and_bound import (
     _push_quarters,
     _SearchProblem,
-    build_constraint_pyramid,
-    constrain_around,
     gather_block_points,
-    is_admissible,
     make_reverse_check,
     search_cells,
     sum_contradictions,
 )
+from hmt_slam_ros.registration.position_constraint import (
+    build_constraint_pyramid,
+    constrain_around,
+    is_admissible,
+    is_admissible_within,
+    is_block_admissible,
+)
 from hmt_slam_ros.registration.search_bounds import (
     BLOCK,
+    MAX_HEIGHT,
+    MIN_HEIGHT,
+    PAD,
+    TOO_WIDE,
+    WIDTHS,
     LogRatioGrid,
+    SquareRange,
     add_block,
     build_pyramid,
     count_known,
+    group_turns,
     lattice_bounds,
     make_search_window,
     prior_bound,
     quarter_bounds,
     sample_cells,
     sort_by_phase,
+    turns_in_group,
 )
 
 
@@ -42,25 +54,53 @@ def values_at(level, cells, i, j):
     return np.where(inside, level[np.where(inside, y, 0), np.where(inside, x, 0)], 0).astype(int)
 
 
-def square_bound(level, margin, cells, i, j):
-    """Bound of the sum over the samples in the square that begins at (i, j), steps."""
-    return values_at(level, cells, i + margin, j + margin).sum()
+def values_of(level, corners, classes, x, y):
+    """What the points of a group may be at in the square that begins at tile (x, y), shape (n,), steps."""
+    all_classes = np.array([values_at(each, corners, x + PAD, y + PAD) for each in level])
+    values = np.take_along_axis(all_classes, np.minimum(classes, TOO_WIDE - 1)[None].astype(int), axis=0)[0]
+    return np.where(classes == TOO_WIDE, 64, values)
 
 
-@pytest.mark.parametrize(("height", "shape"), [(2, (40, 27)), (3, (41, 70)), (5, (30, 33))])
-def test_the_bounds_of_a_lattice_are_those_of_its_squares(height, shape):
-    rng, side = np.random.default_rng(height), 2**height
-    level = rng.integers(-128, 65, shape).astype(np.int8)
-    level[rng.random(shape) < 0.5] = 0
-    cells = rng.integers(-90, 90, (300, 2)).astype(np.int32)
-    for (across, along), (i, j) in itertools.product(((1, 1), (5, 2), (2, 6)), ((0, 0), (-37, 12), (64, -200))):
-        phased = sort_by_phase(level, height, across)
-        bounds = lattice_bounds(phased, cells, i, j, along)
-        counts, largest = count_known(phased, cells, i, j, along)
+@pytest.mark.parametrize("shape", [(40, 27), (41, 70), (30, 33)])
+def test_the_bounds_of_a_lattice_are_those_of_its_squares(shape):
+    rng = np.random.default_rng(shape[0])
+    level = rng.integers(-128, 65, (len(WIDTHS), *shape)).astype(np.int8)
+    level[rng.random(level.shape) < 0.5] = 0
+    corners = rng.integers(-60, 60, (300, 2)).astype(np.int32)
+    for (across, along), left, low in itertools.product(((1, 1), (5, 2), (2, 6)), (0, 3), (0, 1)):
+        classes = rng.integers(0, TOO_WIDE + 1, 300).astype(np.int8)
+        phased, squares = sort_by_phase(level, 8), SquareRange(left, low, across, along)
+        bounds = lattice_bounds(phased, corners, classes, squares)
+        for few in (classes, np.minimum(classes, TOO_WIDE - 1)):
+            counts, largest = count_known(phased, corners, few, squares)
+            for a, b in itertools.product(range(across), range(along)):
+                values = values_of(level, corners, few, 4 * (left + a), 4 * (low + b))
+                assert (counts[b, a], largest[b, a]) == ((values != 0).sum(), values.max(initial=0))
         for a, b in itertools.product(range(across), range(along)):
-            values = values_at(level, cells, i + a * side, j + b * side)
-            assert bounds[b, a] == values.sum()
-            assert (counts[b, a], largest[b, a]) == ((values != 0).sum(), values.max(initial=0))
+            assert bounds[b, a] == values_of(level, corners, classes, 4 * (left + a), 4 * (low + b)).sum()
+
+
+@pytest.mark.parametrize("turns", [1, 2, 7, 16, 21])
+def test_of_a_group_of_turns_a_point_has_the_smallest_square_of_tiles_that_has_all_of_its_squares(turns):
+    rng = np.random.default_rng(turns)
+    cells = (rng.integers(-40, 40, (1, 60, 2)) + rng.integers(0, 25, (turns, 60, 2))).astype(np.int32)
+    cells[:, :30] = cells[:1, :30] + np.arange(turns)[:, None, None] // 3
+    window_first, seen = np.array([-7, 5]), set()
+    groups = group_turns(cells, window_first)
+    assert groups.first[-1] == len(groups.corners) == len(groups.classes)
+    for height in range(MIN_HEIGHT, MAX_HEIGHT + 1):
+        tile, size = 2 ** (height - MIN_HEIGHT), turns_in_group(height)
+        numbers = range(groups.first[height - MIN_HEIGHT], groups.first[height - MIN_HEIGHT + 1])
+        assert size == 2 ** (height - 1)
+        assert len(numbers) == math.ceil(turns / size)
+        for n, number in enumerate(numbers):
+            group = cells[n * size : (n + 1) * size] + window_first
+            np.testing.assert_array_equal(groups.corners[number], np.floor(group.min(axis=0) / tile))
+            end = group.max(axis=0) + 2**height
+            tiles = (np.ceil(end / tile) - groups.corners[number]).max(axis=1)
+            np.testing.assert_array_equal(groups.classes[number], np.searchsorted(WIDTHS, tiles))
+            seen |= set(groups.classes[number].tolist())
+    assert len(seen) == (1 if turns == 1 else 4)
 
 
 def test_a_constraint_admits_the_cells_within_the_radius_of_a_position_anywhere_in_them():
@@ -82,7 +122,7 @@ def test_half_of_the_keyframes_have_to_be_near_positions_and_one_near_a_searched
     keyframes = rng.uniform(-1.0, 1.0, (4 + seed % 2, 2))
     window = make_search_window(np.zeros(3), np.diag([0.4, 0.4, 0.4]) ** 2, 0.1, 0.2, 9.0)
     given = constrain_around(known, is_searched, keyframes, 0.4, 0.1)
-    constraint = build_constraint_pyramid(given, window, 2)
+    constraint = build_constraint_pyramid(given, window)
     allowed, found = np.pad(given.allowed.log_ratio, 99), []
     for k, i, j in rng.integers([0, *window.first], [window.turns.size, *window.last + 1], (200, 3)).tolist():
         admissible = []
@@ -90,8 +130,11 @@ def test_half_of_the_keyframes_have_to_be_near_positions_and_one_near_a_searched
             column, row = (constraint.keyframes[k] + [x, y] + 99).T
             values = allowed[row, column]
             admissible.append(2 * (values > 0.0).sum() >= len(values) and values.max() == 1.0)
-        assert is_admissible(constraint, 0, k, i, j) == admissible[0]
-        assert is_admissible(constraint, 2, k, i, j) or not any(admissible)
+        assert is_admissible(constraint, k, i, j) == admissible[0]
+        assert is_block_admissible(constraint, k, i, j) or not any(admissible)
+        assert is_admissible_within(constraint, 2, k // 2, i - window.first[0], j - window.first[1]) or not any(
+            admissible
+        )
         found.append(admissible[0])
     assert {False, True} == set(found)
 
@@ -110,18 +153,23 @@ def test_the_lattice_is_the_gate_within_bounds(mean):
     assert inside.last.tolist() == [free.last[0], 2]
 
 
-@pytest.mark.parametrize("height", [1, 3])
-def test_a_pyramid_has_the_largest_log_ratios_of_squares_in_steps(height):
-    log_ratio = np.random.default_rng(4).normal(size=(13, 18)).astype(np.float32)
-    pyramid = build_pyramid(log_ratio, height)
+@pytest.mark.parametrize("shape", [(13, 18), (4, 9), (33, 24)])
+def test_a_pyramid_has_the_largest_log_ratios_of_squares_of_tiles_in_steps(shape):
+    log_ratio = np.random.default_rng(4).normal(size=shape).astype(np.float32)
+    pyramid = build_pyramid(log_ratio)
     assert pyramid.step == pytest.approx(log_ratio.max() / 64.0)
-    wide = np.pad(log_ratio, pyramid.margin)
-    assert pyramid.margin == 2**height
-    assert pyramid.levels.shape == (height + 1, *wide.shape)
-    for level, side in enumerate(2 ** np.arange(height + 1)):
-        for y, x in itertools.product(range(pyramid.margin + 13), range(pyramid.margin + 18)):
-            steps = wide[y : y + side, x : x + side].max() / pyramid.step
-            assert pyramid.levels[level, y, x] == max(-128, math.ceil(steps - 1e-4))
+    wide = np.pad(log_ratio, 99)
+    steps = np.maximum(-128, np.ceil(wide / pyramid.step - 1e-4))
+    rows, columns = pyramid.cells.shape
+    np.testing.assert_array_equal(pyramid.cells, steps[99 - PAD :, 99 - PAD :][:rows, :columns])
+    assert len(pyramid.levels) == MAX_HEIGHT + 1 - MIN_HEIGHT
+    for tile, level in zip((1, 2, 4), pyramid.levels, strict=True):
+        assert level.shape[0] == len(WIDTHS)
+        assert level.shape[1:] == tuple(-(-size // 4) * 4 // tile + 2 * PAD for size in shape)
+        for c, y, x in itertools.product(*map(range, level.shape)):
+            left, low, side = 99 + (x - PAD) * tile, 99 + (y - PAD) * tile, WIDTHS[c] * tile
+            inside = x < level.shape[2] - PAD and y < level.shape[1] - PAD
+            assert level[c, y, x] == (steps[low : low + side, left : left + side].max() if inside else 0)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -194,7 +242,10 @@ def test_cells_near_a_contradiction_are_marked_as_far_as_points_may_lie_off_the_
     log_ratio = np.where(np.random.default_rng(6).random((7, 12)) < 0.04, -0.5, 0.3).astype(np.float32)
     log_ratio[0, -1], log_ratio[-1, 0] = -1e-3, 0.0
     window = make_search_window(np.array([0.2, -0.1, 0.4]), np.diag([0.2, 0.2, 0.1]) ** 2, 0.1, 0.08, 9.0)
-    check = make_reverse_check(window, LogRatioGrid(log_ratio, np.zeros(2), 0.1 / ratio), np.zeros((0, 2)))
+    check = make_reverse_check(window, LogRatioGrid(log_ratio, np.zeros(2), 0.1 / ratio), np.zeros((1, 2)))
+    assert not check.negative.any()
+    for _ in range(2):
+        gather_block_points(check, window, (0, 0, 0), np.empty((1, 2)))
     near = maximum_filter(np.pad(log_ratio < 0.0, check.reach), 2 * check.reach + 1, mode="constant")
     np.testing.assert_array_equal(check.negative, near)
 
@@ -205,7 +256,8 @@ def test_sums_over_samples_are_those_of_the_cells_where_they_lie(seed):
     surface = LogRatioGrid(rng.normal(size=(20, 28)).astype(np.float32), rng.uniform(-1.5, -0.5, 2), 0.1)
     samples = rng.uniform(-1.0, 1.0, (6, 2))
     window = make_search_window(rng.uniform(-0.5, 0.5, 3), np.diag([0.2, 0.2, 0.1]) ** 2, 0.1, 0.08, 9.0)
-    cells, pyramid = sample_cells(window, surface, samples), build_pyramid(surface.log_ratio, 3)
+    cells, pyramid = sample_cells(window, surface, samples), build_pyramid(surface.log_ratio)
+    groups = group_turns(cells, window.first)
     wide = np.pad(surface.log_ratio, 40)
     for k, i, j in itertools.product(range(window.turns.size), (-6, -1, 4), (-5, 0, 3)):
         pose = window.mean + np.array([i * 0.1, j * 0.1, window.turns[k]])
@@ -216,11 +268,12 @@ def test_sums_over_samples_are_those_of_the_cells_where_they_lie(seed):
         expected = sum(wide[40 + y : 40 + y + BLOCK, 40 + x : 40 + x + BLOCK].astype(float) for x, y in at)
         np.testing.assert_allclose(totals, expected, atol=1e-5)
         # One by one: interpreted, sums of int8 overflow.
-        for n, (level, side) in itertools.product(range(len(at)), ((1, 2), (2, 4))):
-            bounds, own = (pyramid.levels[level], pyramid.margin, cells[k, n : n + 1]), at[n] + pyramid.margin
-            four = [square_bound(*bounds, i + x, j + y) for y in (0, side) for x in (0, side)]
-            assert np.ravel(quarter_bounds(*bounds, i, j, side)).tolist() == four
-            assert four[0] == (bounds[0][own[1], own[0]] if (own >= 0).all() and (own < (44, 36)).all() else 0)
+        for n, height in itertools.product(range(len(at)), range(MIN_HEIGHT, MAX_HEIGHT + 1)):
+            level, number = pyramid.levels[height - MIN_HEIGHT], groups.first[height - MIN_HEIGHT] + (k >> (height - 1))
+            x, y = (np.array([i, j]) - window.first) >> (height - MIN_HEIGHT)
+            point = groups.corners[number, n : n + 1], groups.classes[number, n : n + 1]
+            four = [values_of(level, *point, x + right, y + down).sum() for down in (0, 4) for right in (0, 4)]
+            assert np.ravel(quarter_bounds(level, *point, x, y)).tolist() == four
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -234,23 +287,29 @@ def test_of_a_square_the_quarters_are_searched_that_may_hold_a_cell_the_best_fir
     constraint = build_constraint_pyramid(
         constrain_around(rng.uniform(-1.0, 1.0, (3, 2)), np.ones(3, bool), rng.uniform(-1.0, 1.0, (2, 2)), 0.3, 0.1),
         window,
-        3,
     )
-    pyramid, cells = build_pyramid(surface.log_ratio, 3), sample_cells(window, surface, samples)
-    problem = _SearchProblem(window, surface, pyramid, cells, constraint, reverse, 0.5, 2.0)
-    pushed = []
-    for k, i, j in rng.integers([0, *window.first], [window.turns.size, *window.last + 1], (80, 3)).tolist():
-        height = 1 + (i + j) % 2
-        side, least = 2**height, rng.uniform(-3.0, 0.0)
+    pyramid, cells = build_pyramid(surface.log_ratio), sample_cells(window, surface, samples)
+    groups = group_turns(cells, window.first)
+    problem = _SearchProblem(window, surface, pyramid, cells, groups, constraint, reverse, 0.5, 2.0)
+    pushed, last = [], window.turns.size - 1
+    for k, a, b in rng.integers(0, [window.turns.size, 9, 9], (300, 3)).tolist():
+        height = 2 + (a + b) % 2
+        side, tile, g, least = 2**height, 2 ** (height - 2), k >> (height - 1), rng.uniform(-3.0, 0.0)
+        number, i, j = groups.first[height - 2] + g, window.first[0] + a * side, window.first[1] + b * side
         expected = {}
         for x, y in itertools.product((i, i + side), (j, j + side)):
-            forward = 0.5 * pyramid.step * square_bound(pyramid.levels[height], pyramid.margin, cells[k], x, y)
-            bound = forward + prior_bound(window, k, x, y, side)
-            within = x <= window.last[0] and y <= window.last[1] and is_admissible(constraint, height, k, x, y)
+            tiles = (x - window.first[0]) // tile, (y - window.first[1]) // tile
+            of_group = groups.corners[number], groups.classes[number]
+            forward = 0.5 * pyramid.step * values_of(pyramid.levels[height - 2], *of_group, *tiles).sum()
+            turns = range(g << (height - 1), min(last, ((g + 1) << (height - 1)) - 1) + 1)
+            bound = forward + max(prior_bound(window, turn, x, y, side) for turn in turns)
+            within = (
+                x <= window.last[0] and y <= window.last[1] and is_admissible_within(constraint, height, number, *tiles)
+            )
             if within and min(forward, bound) >= least:
-                expected[k, x, y, height] = bound
+                expected[g, x, y, height] = bound
         stack, bounds = np.full((7, 4), -9), np.full(7, 5.0)
-        size = _push_quarters(problem, stack, bounds, 2, (k, i, j), height, least)
+        size = _push_quarters(problem, stack, bounds, 2, (g, i, j), height, least)
         found = dict(zip(map(tuple, stack[2:size].tolist()), bounds[2:size], strict=True))
         assert found == pytest.approx(expected)
         assert bounds[2:size].tolist() == sorted(bounds[2:size])

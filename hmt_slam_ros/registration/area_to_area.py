@@ -19,8 +19,9 @@ from hmt_slam_ros.configuration.topology import InferenceParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, match_moments
 from hmt_slam_ros.registration import match_modes
-from hmt_slam_ros.registration.branch_and_bound import PositionConstraint, SearchCells, search_cells
+from hmt_slam_ros.registration.branch_and_bound import SearchCells, search_cells
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
+from hmt_slam_ros.registration.position_constraint import PositionConstraint
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid, SearchWindow, make_search_window
 
 _MAX_SADDLE_DEPTH = 3.0

@@ -16,106 +16,38 @@ import numpy as np
 from hmt_slam_ros.arrays import Bool, Float32, Float64, Int32, Int64
 from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.se2 import rotate_back
+from hmt_slam_ros.registration.position_constraint import (
+    AROUND_STEPS,
+    ConstraintPyramid,
+    PositionConstraint,
+    build_constraint_pyramid,
+    is_admissible,
+    is_admissible_within,
+    is_block_admissible,
+    no_constraint,
+)
 from hmt_slam_ros.registration.search_bounds import (
     BLOCK,
-    TOP_STEPS,
+    MAX_HEIGHT,
+    MIN_HEIGHT,
+    TILES,
     LogRatioGrid,
+    PhasedLevel,
     Pyramid,
     SearchWindow,
+    SquareRange,
+    TurnGroups,
     add_block,
     build_pyramid,
     count_known,
+    group_turns,
     lattice_bounds,
     prior_bound,
     quarter_bounds,
     sample_cells,
     sort_by_phase,
+    turns_in_group,
 )
-
-_OWN, _AROUND = 1.0, 0.5
-"""Values of cells near a position that is searched, and near one around those."""
-
-_AROUND_STEPS = round(_AROUND / _OWN * TOP_STEPS)
-"""The latter in a pyramid, steps."""
-
-
-class PositionConstraint(NamedTuple):
-    """Cells in which half of the query's keyframes have to be, one of them in a cell near a searched position.
-
-    :ivar allowed: candidate frame, 1 near a searched position, 0.5 near one around those, 0 elsewhere.
-    :ivar keyframes: shape (m, 2), positions of the keyframes, m, query frame; none without a constraint.
-    """
-
-    allowed: LogRatioGrid
-    keyframes: Float64
-
-
-class ConstraintPyramid(NamedTuple):
-    """A position constraint, prepared for a search.
-
-    :ivar pyramid: running maxima of its cells.
-    :ivar keyframes: shape (turns, m, 2), column and row of every keyframe without a shift.
-    """
-
-    pyramid: Pyramid
-    keyframes: Int32
-
-
-def constrain_around(
-    known: Float64, is_searched: Bool, keyframes: Float64, radius: float, cell: float
-) -> PositionConstraint:
-    """The constraint to within ``radius``, m, of the positions ``known``, shape (n, 2), m.
-
-    :param is_searched: shape (n,), which of them are searched; the others lie around those.
-    :param keyframes: shape (m, 2), m, query frame.
-    :param cell: edge of a cell, m.
-    """
-    # With a keyframe anywhere in a cell.
-    reach = radius + cell
-    origin = np.floor((known.min(axis=0) - reach) / cell) * cell
-    columns, rows = np.ceil((known.max(axis=0) + reach - origin) / cell).astype(np.int64) + 1
-    cells = np.zeros((rows, columns), np.float32)
-    for positions, value in ((known, _AROUND), (known[is_searched], _OWN)):
-        _mark_disks(cells, (positions - origin) / cell - 0.5, reach / cell, value)
-    return PositionConstraint(LogRatioGrid(cells, origin, cell), keyframes)
-
-
-def no_constraint(cell: float) -> PositionConstraint:
-    """The constraint that admits all positions."""
-    return PositionConstraint(LogRatioGrid(np.zeros((1, 1), np.float32), np.zeros(2), cell), np.zeros((0, 2)))
-
-
-def build_constraint_pyramid(constraint: PositionConstraint, window: SearchWindow, height: int) -> ConstraintPyramid:
-    """A constraint for a search of a window down from squares of edge ``2**height``."""
-    pyramid = build_pyramid(constraint.allowed.log_ratio, height)
-    return ConstraintPyramid(pyramid, sample_cells(window, constraint.allowed, constraint.keyframes))
-
-
-@njit(cache=True)
-def _mark_disks(cells: Float32, known: Float64, reach: float, value: float) -> None:
-    """Write ``value`` to the cells within ``reach`` cells of the positions ``known``, shape (n, 2), cells."""
-    rows, columns = cells.shape
-    for n in range(known.shape[0]):
-        x, y = known[n, 0], known[n, 1]
-        for r in range(max(0, int(np.ceil(y - reach))), min(rows, int(np.floor(y + reach)) + 1)):
-            half = np.sqrt(max(0.0, reach * reach - (r - y) ** 2))
-            cells[r, max(0, int(np.ceil(x - half))) : min(columns, int(np.floor(x + half)) + 1)] = np.float32(value)
-
-
-@njit(cache=True)
-def is_admissible(constraint: ConstraintPyramid, height: int, k: int, i: int, j: int) -> bool:
-    """Whether the constraint can be met at turn ``k`` in the square of shifts that begins at (i, j)."""
-    level, margin, cells = constraint.pyramid.levels[height], constraint.pyramid.margin, constraint.keyframes[k]
-    rows, columns = np.uint32(level.shape[0]), np.uint32(level.shape[1])
-    count, outside, largest = cells.shape[0], 0, 0
-    for n in range(count):
-        x, y = np.uint32(cells[n, 0] + i + margin), np.uint32(cells[n, 1] + j + margin)
-        value = level[y, x] if x < columns and y < rows else 0
-        largest = max(largest, value)
-        outside += value == 0
-        if 2 * outside > count:
-            return False
-    return count == 0 or largest > _AROUND_STEPS
 
 
 class ReverseCheck(NamedTuple):
@@ -126,6 +58,7 @@ class ReverseCheck(NamedTuple):
     :ivar rotated_points: shape (turns, m, 2), the same in the query's frame without a shift, cells of the grid.
     :ivar is_rotated: shape (turns,), at which turns they are computed: few turns have a block that is tested.
     :ivar negative: for cells of the grid and ``reach`` beyond, whether a cell within ``reach`` has a log-ratio below 0.
+    :ivar is_marked: shape (1,), whether those are computed: most searches test no block.
     :ivar reach: largest distance between a point at a shift of a block and at its middle, plus one, cells.
     """
 
@@ -134,6 +67,7 @@ class ReverseCheck(NamedTuple):
     rotated_points: Float32
     is_rotated: Bool
     negative: Bool
+    is_marked: Bool
     reach: int
 
 
@@ -142,8 +76,9 @@ def make_reverse_check(window: SearchWindow, grid: LogRatioGrid, points: Float64
     reach = math.ceil(math.sqrt(0.5) * (BLOCK - 1) * window.cell / grid.cell) + 1
     turns = window.turns.size
     rotated = np.empty((turns, len(points), 2), np.float32)
-    negative = _near_negative(grid.log_ratio, reach)
-    return ReverseCheck(grid, points, rotated, np.zeros(turns, np.bool_), negative, reach)
+    rows, columns = grid.log_ratio.shape
+    negative = np.zeros((rows + 2 * reach, columns + 2 * reach), np.bool_)
+    return ReverseCheck(grid, points, rotated, np.zeros(turns, np.bool_), negative, np.zeros(1, np.bool_), reach)
 
 
 @njit(cache=True)
@@ -163,25 +98,31 @@ def _rotate_points(check: ReverseCheck, window: SearchWindow, k: int) -> Float32
 
 
 @njit(cache=True)
-def _near_negative(log_ratio: Float32, reach: int) -> Bool:
+def _mark_near_negative(check: ReverseCheck) -> Bool:
+    """The cells near one with a negative log-ratio, marked at the first call."""
+    log_ratio, negative, reach = check.grid.log_ratio, check.negative, check.reach
+    if check.is_marked[0]:
+        return negative
     rows, columns = log_ratio.shape
     across = np.zeros((rows, columns + 2 * reach), np.bool_)
     for r in range(rows):
         for shift in range(2 * reach + 1):
             for c in range(columns):
                 across[r, c + shift] |= log_ratio[r, c] < 0.0
-    negative = np.zeros((rows + 2 * reach, columns + 2 * reach), np.bool_)
     for r in range(rows):
         for shift in range(2 * reach + 1):
             for c in range(across.shape[1]):
                 negative[r + shift, c] |= across[r, c]
+    check.is_marked[0] = True
     return negative
 
 
 @njit(cache=True)
 def gather_block_points(check: ReverseCheck, window: SearchWindow, node: tuple[int, int, int], points: Float64) -> int:
     """Write to ``points`` those that may contradict in the block that begins at ``node``; returns their number."""
-    negative, rotated = check.negative, _rotate_points(check, window, node[0])
+    if check.points.shape[0] == 0:
+        return 0
+    negative, rotated = _mark_near_negative(check), _rotate_points(check, window, node[0])
     angle, ratio = window.mean[2] + window.turns[node[0]], window.cell / check.grid.cell
     cos, sin = ratio * np.cos(angle), ratio * np.sin(angle)
     x, y = node[1] + 0.5 * (BLOCK - 1), node[2] + 0.5 * (BLOCK - 1)
@@ -217,8 +158,8 @@ def sum_contradictions(
     return total
 
 
-_MIN_HEIGHT, _MAX_HEIGHT = 2, 5
-"""Heights of the coarsest nodes; squares of the lowest are blocks."""
+_LATTICE_SQUARES = 16
+"""Squares of a lattice that take as long as one that is read alone."""
 
 
 class SearchCells(NamedTuple):
@@ -240,12 +181,14 @@ class _SearchProblem(NamedTuple):
     """A search problem; the members are the arguments of :func:`search_cells`.
 
     :ivar cells: of the samples, see :func:`sample_cells`.
+    :ivar groups: the same for groups of turns.
     """
 
     window: SearchWindow
     surface: LogRatioGrid
     bounds: Pyramid
     cells: Int32
+    groups: TurnGroups
     constraint: ConstraintPyramid
     reverse: ReverseCheck
     temper: float
@@ -276,13 +219,15 @@ def search_cells(
     if (window.first > window.last).any():
         return SearchCells(np.empty((0, 3), dtype=np.int64), np.empty(0), np.empty(0))
     edge = max(1, int((window.last - window.first).max()))
-    height = min(_MAX_HEIGHT, max(_MIN_HEIGHT, int(np.ceil(np.log2(edge))) - 2))
+    height = min(MAX_HEIGHT, max(MIN_HEIGHT, int(np.ceil(np.log2(edge))) - 2))
+    sampled = sample_cells(window, surface, samples)
     task = _SearchProblem(
         window,
         surface,
-        build_pyramid(surface.log_ratio, height),
-        sample_cells(window, surface, samples),
-        build_constraint_pyramid(constraint or no_constraint(window.cell), window, height),
+        build_pyramid(surface.log_ratio),
+        sampled,
+        group_turns(sampled, window.first),
+        build_constraint_pyramid(constraint or no_constraint(window.cell), window),
         make_reverse_check(window, reverse_grid, reverse_samples),
         temper,
         margin,
@@ -295,15 +240,15 @@ def search_cells(
 
 @njit(cache=True)
 def _search_depth_first(task: _SearchProblem, height: int, threshold: float) -> tuple[Float64, int]:
-    """Cells (k, i, j, score, contradiction), a superset of the result, and the number of squares with a bound.
+    """Cells (k, i, j, score, contradiction), a superset of the result, and the number of squares that were read.
 
     Depth first, best bound first.
     """
-    nodes, coarse = _coarse_nodes(task, height)
-    stack, bounds = np.empty((4 * height + 8, 4), dtype=np.int64), np.empty(4 * height + 8)
+    nodes, coarse, squares = _coarse_nodes(task, height, threshold)
+    stack, bounds = np.empty((8 * height, 4), dtype=np.int64), np.empty(8 * height)
     found, count = np.empty((1024, 5)), 0
     points = np.empty_like(task.reverse.points)
-    least, squares = threshold, len(nodes)
+    least = threshold
     for n in np.argsort(-coarse, kind="mergesort"):
         stack[0, :3], stack[0, 3], bounds[0] = nodes[n], height, coarse[n]
         size = 1
@@ -311,48 +256,88 @@ def _search_depth_first(task: _SearchProblem, height: int, threshold: float) -> 
             size -= 1
             if bounds[size] < least:
                 continue
-            k, i, j, h = stack[size, 0], stack[size, 1], stack[size, 2], stack[size, 3]
-            squares += BLOCK
-            if 2**h > BLOCK:
-                size = _push_quarters(task, stack, bounds, size, (k, i, j), h - 1, least)
+            g, i, j, h = stack[size, 0], stack[size, 1], stack[size, 2], stack[size, 3]
+            if h > MIN_HEIGHT:
+                squares += 2 * BLOCK
+                for half in range(2 * g, min(2 * g + 2, _count_groups(task, h - 1))):
+                    size = _push_quarters(task, stack, bounds, size, (half, i, j), h - 1, least)
                 continue
-            if count + BLOCK * BLOCK > len(found):
-                found = np.concatenate((found, np.empty_like(found)))
-            count, least = _take_cells(task, (k, i, j), points, found, count, least)
+            turns = turns_in_group(h)
+            for k in range(g * turns, min((g + 1) * turns, task.window.turns.size)):
+                if not is_block_admissible(task.constraint, k, i, j):
+                    continue
+                squares += BLOCK
+                if count + BLOCK * BLOCK > len(found):
+                    found = np.concatenate((found, np.empty_like(found)))
+                count, least = _take_cells(task, (k, i, j), points, found, count, least)
     return found[:count], squares
 
 
 @njit(cache=True)
-def _coarse_nodes(task: _SearchProblem, height: int) -> tuple[Int64, Float64]:
-    """The coarsest nodes (k, i, j) of all turns, and their bounds."""
-    window, side = task.window, 2**height
-    across, along = (window.last - window.first) // side + 1
-    level = sort_by_phase(task.bounds.levels[height], height, across)
-    allowed = sort_by_phase(task.constraint.pyramid.levels[height], height, across)
-    x, y = window.first + task.bounds.margin
-    nodes = np.empty((window.turns.size * across * along, 3), dtype=np.int64)
-    bounds = np.empty(nodes.shape[0])
+def _count_groups(task: _SearchProblem, height: int) -> int:
+    return task.groups.first[height + 1 - MIN_HEIGHT] - task.groups.first[height - MIN_HEIGHT]
+
+
+@njit(cache=True)
+def _coarse_nodes(task: _SearchProblem, height: int, threshold: float) -> tuple[Int64, Float64, int]:
+    """The coarsest nodes (g, i, j) with a bound of ``threshold``, their bounds, and the number of squares read.
+
+    Of a lattice that is the rectangle around the squares that the constraint admits.
+    """
+    tile, groups = height - MIN_HEIGHT, task.groups
+    across, along = (task.window.last - task.window.first) // 2**height + 1
+    level = sort_by_phase(task.bounds.levels[tile], across)
+    allowed = sort_by_phase(task.constraint.pyramid.levels[tile], across)
+    nodes, bounds = np.empty((1024, 3), dtype=np.int64), np.empty(1024)
+    admitted = np.empty((across * along, 2), dtype=np.int64)
+    count, squares = 0, 0
+    for g in range(_count_groups(task, height)):
+        group = groups.first[tile] + g
+        size = _find_admitted(task.constraint.groups, allowed, group, across, along, admitted)
+        if size == 0:
+            continue
+        a, b = admitted[:size, 0], admitted[:size, 1]
+        box = SquareRange(a.min(), b.min(), a.max() - a.min() + 1, b.max() - b.min() + 1)
+        steps = lattice_bounds(level, groups.corners[group], groups.classes[group], box)
+        squares += box.across * box.along
+        if count + size > len(nodes):
+            nodes = np.concatenate((nodes, np.empty((len(nodes) + size, 3), np.int64)))
+            bounds = np.concatenate((bounds, np.empty(len(bounds) + size)))
+        for n in range(size):
+            bound = task.temper * task.bounds.step * steps[b[n] - box.low, a[n] - box.left]
+            if bound < threshold:
+                continue
+            i, j = task.window.first[0] + (a[n] << height), task.window.first[1] + (b[n] << height)
+            bound += _group_prior_bound(task.window, height, g, i, j)
+            if bound >= threshold:
+                nodes[count, 0], nodes[count, 1], nodes[count, 2], bounds[count] = g, i, j, bound
+                count += 1
+    return nodes[:count], bounds[:count], squares // _LATTICE_SQUARES
+
+
+@njit(cache=True)
+def _find_admitted(
+    keyframes: TurnGroups, allowed: PhasedLevel, group: int, across: int, along: int, admitted: Int64
+) -> int:
+    """Write the squares (a, b) of a lattice in which the constraint can be met, and return their number."""
+    corners, classes = keyframes.corners[group], keyframes.classes[group]
+    near, largest = count_known(allowed, corners, classes, SquareRange(0, 0, across, along))
     count = 0
-    for k in range(window.turns.size):
-        before = count
-        keyframes = task.constraint.keyframes[k]
-        near, largest = count_known(allowed, keyframes, x, y, along)
+    for b in range(along):
         for a in range(across):
-            for b in range(along):
-                if keyframes.shape[0] > 0 and (2 * near[b, a] < keyframes.shape[0] or largest[b, a] <= _AROUND_STEPS):
-                    continue
-                i, j = window.first[0] + a * side, window.first[1] + b * side
-                prior = prior_bound(window, k, i, j, side)
-                if prior > -np.inf:
-                    nodes[count, 0], nodes[count, 1], nodes[count, 2] = k, i, j
-                    bounds[count] = prior
-                    count += 1
-        if count > before:
-            steps = lattice_bounds(level, task.cells[k], x, y, along)
-            for n in range(before, count):
-                a, b = (nodes[n, 1] - window.first[0]) // side, (nodes[n, 2] - window.first[1]) // side
-                bounds[n] = task.temper * task.bounds.step * steps[b, a] + bounds[n]
-    return nodes[:count], bounds[:count]
+            if len(corners) == 0 or (2 * near[b, a] >= len(corners) and largest[b, a] > AROUND_STEPS):
+                admitted[count, 0], admitted[count, 1] = a, b
+                count += 1
+    return count
+
+
+@njit(cache=True)
+def _group_prior_bound(window: SearchWindow, height: int, g: int, i: int, j: int) -> float:
+    """The largest exponent of the prior at a turn of a group in the square that begins at (i, j); -inf for none."""
+    turns, largest = turns_in_group(height), -np.inf
+    for k in range(g * turns, min((g + 1) * turns, window.turns.size)):
+        largest = max(largest, prior_bound(window, k, i, j, 1 << height))
+    return largest
 
 
 @njit(cache=True)
@@ -365,23 +350,28 @@ def _push_quarters(
     height: int,
     least: float,
 ) -> int:
-    """Push a node's four squares with a bound of ``least``, the best on top; returns the new size of the stack."""
-    window, side = task.window, 2**height
-    k, i, j = node
-    steps = quarter_bounds(task.bounds.levels[height], task.bounds.margin, task.cells[k], i, j, side)
+    """Push four squares at a group of turns with a bound of ``least``, the best on top; returns the stack's new size.
+
+    :param node: the group, and where the first square begins.
+    :param height: of the squares.
+    """
+    window, side, tile = task.window, 2**height, height - MIN_HEIGHT
+    g, i, j = node
+    group, x, y = task.groups.first[tile] + g, (i - window.first[0]) >> tile, (j - window.first[1]) >> tile
+    steps = quarter_bounds(task.bounds.levels[tile], task.groups.corners[group], task.groups.classes[group], x, y)
     first = size
     for down in range(2):
         for right in range(2):
-            x, y = i + right * side, j + down * side
+            left, low = i + right * side, j + down * side
             bound = task.temper * task.bounds.step * steps[down][right]
             if (
                 bound < least
-                or x > window.last[0]
-                or y > window.last[1]
-                or not is_admissible(task.constraint, height, k, x, y)
+                or left > window.last[0]
+                or low > window.last[1]
+                or not is_admissible_within(task.constraint, height, group, x + right * TILES, y + down * TILES)
             ):
                 continue
-            bound += prior_bound(window, k, x, y, side)
+            bound += _group_prior_bound(window, height, g, left, low)
             if bound < least:
                 continue
             place = size
@@ -389,7 +379,7 @@ def _push_quarters(
                 stack[place] = stack[place - 1]
                 bounds[place] = bounds[place - 1]
                 place -= 1
-            stack[place, 0], stack[place, 1], stack[place, 2], stack[place, 3] = k, x, y, height
+            stack[place, 0], stack[place, 1], stack[place, 2], stack[place, 3] = g, left, low, height
             bounds[place] = bound
             size += 1
     return size
@@ -414,7 +404,7 @@ def _take_cells(
             if score < least:
                 continue
             score += prior_bound(window, k, x, y, 1)
-            if score < least or not is_admissible(task.constraint, 0, k, x, y):
+            if score < least or not is_admissible(task.constraint, k, x, y):
                 continue
             if near < 0:
                 near = gather_block_points(task.reverse, window, node, points)

@@ -110,30 +110,76 @@ class LogRatioGrid(NamedTuple):
     cell: float
 
 
-class Pyramid(NamedTuple):
-    """Running maxima of log-ratios.
+MIN_HEIGHT, MAX_HEIGHT = 2, 4
+"""Heights of the lowest squares, which are blocks, and of the highest: an edge of height h has 2^h cells."""
 
-    :ivar levels: shape (h + 1, rows + 2 margin, columns + 2 margin), int8, steps. Element [l, y, x] is no less than the
-        log-ratios in the square of 2^l x 2^l cells that begins at cell (x, y) - margin; beyond the grid they are 0.
-    :ivar margin: 2^h.
+TILES = 4
+"""Tiles along the edge of a square; those of the lowest squares are cells."""
+
+WIDTHS = (5, 6, 8)
+"""Tiles along the edge of the larger squares of which a pyramid has the maxima, for classes of points."""
+
+TOO_WIDE = len(WIDTHS)
+"""Class of points that move so far in a group of turns that no such square has all of their squares."""
+
+PAD = WIDTHS[-1]
+"""Tiles of 0 on every side of a level."""
+
+
+class Pyramid(NamedTuple):
+    """Maxima of log-ratios, in steps.
+
+    :ivar cells: shape (rows + 2 PAD, columns + 2 PAD), int8, the log-ratios; 0 beyond the grid.
+    :ivar levels: for every height from MIN_HEIGHT on, shape (len(WIDTHS), rows + 2 PAD, columns + 2 PAD), int8. Element
+        [c, y, x] is no less than the log-ratios in the square of WIDTHS[c] x WIDTHS[c] tiles that begins at tile
+        (x, y) - PAD; beyond the grid they are 0.
     :ivar step: nats.
     """
 
-    levels: Int8
-    margin: int
+    cells: Int8
+    levels: tuple[Int8, ...]
     step: float
 
 
-def build_pyramid(log_ratio: Float32, height: int) -> Pyramid:
-    """The pyramid of a grid, with levels 0 to ``height``."""
-    margin = 2**height
+def build_pyramid(log_ratio: Float32) -> Pyramid:
+    """The pyramid of a grid."""
     step = max(float(log_ratio.max()), 1e-6) / TOP_STEPS
-    rows, columns = log_ratio.shape
-    levels = np.zeros((height + 1, rows + 2 * margin, columns + 2 * margin), dtype=np.int8)
-    _round_up(log_ratio, 1.0 / step, levels[0, margin:, margin:])
-    for level in range(height):
-        _widen(levels[level], levels[level + 1], 2**level)
-    return Pyramid(levels, margin, step)
+    # Whole tiles of all heights.
+    largest = 2 ** (MAX_HEIGHT - MIN_HEIGHT)
+    rows, columns = (-(-size // largest) * largest for size in log_ratio.shape)
+    tiles = np.zeros((rows + 2 * PAD, columns + 2 * PAD), dtype=np.int8)
+    _round_up(log_ratio, 1.0 / step, tiles[PAD:, PAD:])
+    cells, levels = tiles, []
+    for height in range(MIN_HEIGHT, MAX_HEIGHT + 1):
+        levels.append(_widen_all(tiles))
+        if height < MAX_HEIGHT:
+            tiles = _merge_tiles(tiles)
+    return Pyramid(cells, tuple(levels), step)
+
+
+@njit(cache=True)
+def _merge_tiles(tiles: Int8) -> Int8:
+    """Maxima of two by two tiles, with the same number of tiles around."""
+    rows, columns = (tiles.shape[0] - 2 * PAD) // 2, (tiles.shape[1] - 2 * PAD) // 2
+    merged = np.zeros((rows + 2 * PAD, columns + 2 * PAD), np.int8)
+    for r in range(rows):
+        above, below, row = tiles[PAD + 2 * r], tiles[PAD + 2 * r + 1], merged[PAD + r]
+        for c in range(columns):
+            x = PAD + 2 * c
+            row[PAD + c] = max(above[x], above[x + 1], below[x], below[x + 1])
+    return merged
+
+
+@njit(cache=True)
+def _widen_all(tiles: Int8) -> Int8:
+    """Maxima over the squares of all widths that begin at a tile, shape (len(WIDTHS), *tiles.shape)."""
+    two, four = np.zeros_like(tiles), np.zeros_like(tiles)
+    wide = np.zeros((len(WIDTHS), *tiles.shape), np.int8)
+    _widen(tiles, two, 1)
+    _widen(two, four, 2)
+    for c in range(len(WIDTHS)):
+        _widen(four, wide[c], WIDTHS[c] - TILES)
+    return wide
 
 
 @njit(cache=True)
@@ -145,7 +191,7 @@ def _round_up(log_ratio: Float32, scale: float, steps: Int8) -> None:
 
 @njit(cache=True)
 def _widen(below: Int8, above: Int8, side: int) -> None:
-    """Write maxima over squares twice as large; the last rows and columns are outside the grid and stay 0."""
+    """Write maxima over squares larger by ``side``; the last rows and columns are outside the grid and stay 0."""
     rows, columns = below.shape[0] - side, below.shape[1] - side
     for r in range(rows):
         first, right = below[r, :columns], below[r, side:]
@@ -168,84 +214,160 @@ def sample_cells(window: SearchWindow, surface: LogRatioGrid, samples: Float64) 
     return cells
 
 
+class TurnGroups(NamedTuple):
+    """Where points lie at any turn of a group, so that one bound holds for all its turns.
+
+    :ivar corners: shape (groups, n, 2), int32, column and row of the tile with the smallest column and row of a point
+        in its group, at the smallest shift of the window.
+    :ivar classes: shape (groups, n), int8, the class of every point: the number of the smallest of ``WIDTHS`` so that
+        the square which begins there has all the squares that begin at the point; ``TOO_WIDE`` for none.
+    :ivar first: shape (MAX_HEIGHT + 2 - MIN_HEIGHT,), int64, the number of the first group of every height, and of all.
+    """
+
+    corners: Int32
+    classes: Int8
+    first: Int64
+
+
+@njit(cache=True)
+def turns_in_group(height: int) -> int:
+    """Number of turns in a group: they move most points by less than half a square's edge."""
+    return 1 << (height - 1)
+
+
+@njit(cache=True)
+def group_turns(cells: Int32, window_first: Int64) -> TurnGroups:
+    """The groups of all heights, of points with columns and rows (turns, n, 2).
+
+    :param window_first: smallest shift of the window, shape (2,).
+    """
+    turns, count = cells.shape[0], cells.shape[1]
+    first = np.zeros(MAX_HEIGHT + 2 - MIN_HEIGHT, np.int64)
+    for h in range(MIN_HEIGHT, MAX_HEIGHT + 1):
+        first[h + 1 - MIN_HEIGHT] = first[h - MIN_HEIGHT] + (turns - 1) // turns_in_group(h) + 1
+    corners = np.empty((first[-1], count, 2), np.int32)
+    classes = np.empty((first[-1], count), np.int8)
+    for h in range(MIN_HEIGHT, MAX_HEIGHT + 1):
+        size, start = turns_in_group(h), first[h - MIN_HEIGHT]
+        for g in range(first[h + 1 - MIN_HEIGHT] - start):
+            group = cells[g * size : (g + 1) * size]
+            _bound_group(group, window_first, h - MIN_HEIGHT, corners[start + g], classes[start + g])
+    return TurnGroups(corners, classes, first)
+
+
+@njit(cache=True)
+def _bound_group(cells: Int32, window_first: Int64, tile: int, corners: Int32, classes: Int8) -> None:
+    """Write corners and classes of a group whose turns have the columns and rows (turns, n, 2).
+
+    :param tile: tiles have an edge of ``2**tile`` cells.
+    """
+    for n in range(cells.shape[1]):
+        widest = 0
+        for axis in range(2):
+            low = high = cells[0, n, axis]
+            for k in range(1, cells.shape[0]):
+                low, high = min(low, cells[k, n, axis]), max(high, cells[k, n, axis])
+            corner = (low + window_first[axis]) >> tile
+            corners[n, axis] = corner
+            widest = max(widest, high + window_first[axis] - (corner << tile))
+        c = 0
+        while c < TOO_WIDE and (WIDTHS[c] - TILES) << tile < widest:
+            c += 1
+        classes[n] = c
+
+
 class PhasedLevel(NamedTuple):
     """A level of a pyramid, sorted by position within the squares of a lattice.
 
-    A sample reads all squares of the lattice at the same position within them, so these are neighbors here.
+    A sample reads all squares of the lattice at the same tile within them, so these are neighbors here.
 
-    :ivar rows: shape (side, side, n), int8, steps: for each position [y, x] within a square the elements at it, row by
-        row of the lattice; before every row and after the last one there are ``across`` elements of 0.
+    :ivar rows: shape (len(WIDTHS), TILES, TILES, n), int8, steps: for each class and tile [y, x] of a square the
+        elements at it, row by row of the lattice; before every row and after the last one are ``across`` zeros.
     :ivar shape: number of the lattice's rows and columns.
-    :ivar height: the squares have an edge of ``2**height``.
     :ivar across: largest number of squares that are read along x.
     """
 
     rows: Int8
     shape: tuple[int, int]
-    height: int
     across: int
 
 
 @njit(cache=True)
-def sort_by_phase(level: Int8, height: int, across: int) -> PhasedLevel:
-    """The level for squares of edge ``2**height``, of which ``across`` at most are read along x."""
-    side = 1 << height
-    rows, columns = (level.shape[0] + side - 1) >> height, (level.shape[1] + side - 1) >> height
+def sort_by_phase(level: Int8, across: int) -> PhasedLevel:
+    """A level of a pyramid for a lattice of its squares, of which ``across`` at most are read along x."""
+    rows, columns = -(-level.shape[1] // TILES), -(-level.shape[2] // TILES)
     width = columns + across
-    phases = np.zeros((side, side, across + rows * width), np.int8)
-    for y in range(level.shape[0]):
-        first = across + (y >> height) * width
-        for x in range(side):
-            row = phases[y & (side - 1), x]
-            for c in range((level.shape[1] - x + side - 1) >> height):
-                row[first + c] = level[y, (c << height) + x]
-    return PhasedLevel(phases, (rows, columns), height, across)
+    phases = np.zeros((len(WIDTHS), TILES, TILES, across + rows * width), np.int8)
+    for c in range(len(WIDTHS)):
+        for y in range(level.shape[1]):
+            first = across + y // TILES * width
+            for x in range(level.shape[2]):
+                phases[c, y % TILES, x % TILES, first + x // TILES] = level[c, y, x]
+    return PhasedLevel(phases, (rows, columns), across)
+
+
+class SquareRange(NamedTuple):
+    """A rectangle of squares of a lattice: the first one along x and along y, and their numbers."""
+
+    left: int
+    low: int
+    across: int
+    along: int
 
 
 @njit(cache=True)
-def lattice_bounds(level: PhasedLevel, cells: Int32, i: int, j: int, along: int) -> Int32:
-    """Bounds of the sum over the samples (n, 2) in the squares of a lattice, steps, shape (along, at least across).
+def lattice_bounds(level: PhasedLevel, corners: Int32, classes: Int8, squares: SquareRange) -> Int32:
+    """Bounds of the sum over the samples of a group in the squares of a lattice, steps.
 
     The compiler vectorizes the additions: all squares take less than a tenth of their time one by one.
 
-    :param level: of the pyramid, for squares of this size.
-    :param i: shift along x of the lattice's first square, from the corner of the level, cells; ``j``, along y.
-    :param along: number of squares along y.
+    :param level: of the pyramid.
+    :param corners: shape (n, 2), of the group; ``classes``, shape (n,).
+    :returns: shape (along, at least across).
     """
+    left, low, across, along = squares
     rows, columns = level.shape
-    across, width, last = level.across, columns + level.across, (1 << level.height) - 1
-    totals = np.zeros(along * width, np.int32)
-    for n in range(cells.shape[0]):
-        x, y = cells[n, 0] + i, cells[n, 1] + j
-        column, row = x >> level.height, y >> level.height
+    width = columns + level.across
+    totals, anywhere = np.zeros(along * width, np.int32), 0
+    for n in range(corners.shape[0]):
+        if classes[n] == TOO_WIDE:
+            anywhere += TOP_STEPS
+            continue
+        x, y = corners[n, 0] + PAD, corners[n, 1] + PAD
+        column, row = x // TILES + left, y // TILES + low
         if -across < column < columns and -along < row < rows:
-            low, high = max(0, -row), min(along, rows - row)
-            count = (high - low - 1) * width + across
-            first = across + (row + low) * width + column
-            part, sums = level.rows[y & last, x & last, first : first + count], totals[low * width :]
+            bottom, top = max(0, -row), min(along, rows - row)
+            count = (top - bottom - 1) * width + across
+            first = level.across + (row + bottom) * width + column
+            part, sums = level.rows[classes[n], y % TILES, x % TILES, first : first + count], totals[bottom * width :]
             for c in range(count):
                 sums[c] += part[c]
-    return totals.reshape(along, width)
+    return totals.reshape(along, width) + np.int32(anywhere)
 
 
 @njit(cache=True)
-def count_known(level: PhasedLevel, cells: Int32, i: int, j: int, along: int) -> tuple[Int32, Int8]:
-    """How many of the cells (n, 2) are not 0 in the squares of a lattice, and the largest of them, steps.
+def count_known(level: PhasedLevel, corners: Int32, classes: Int8, squares: SquareRange) -> tuple[Int32, Int8]:
+    """How many of the points may not be at 0 in the squares of a lattice, and the largest that one may be at, steps.
 
     The arguments and the shapes are those of :func:`lattice_bounds`.
     """
+    left, low, across, along = squares
     rows, columns = level.shape
-    across, width, last = level.across, columns + level.across, (1 << level.height) - 1
+    width = columns + level.across
     counts, largest = np.zeros(along * width, np.int32), np.zeros(along * width, np.int8)
-    for n in range(cells.shape[0]):
-        x, y = cells[n, 0] + i, cells[n, 1] + j
-        column, row = x >> level.height, y >> level.height
+    for n in range(corners.shape[0]):
+        if classes[n] == TOO_WIDE:
+            counts += 1
+            largest[:] = TOP_STEPS
+            continue
+        x, y = corners[n, 0] + PAD, corners[n, 1] + PAD
+        column, row = x // TILES + left, y // TILES + low
         if -across < column < columns and -along < row < rows:
-            low, high = max(0, -row), min(along, rows - row)
-            count = (high - low - 1) * width + across
-            first = across + (row + low) * width + column
-            part = level.rows[y & last, x & last, first : first + count]
-            known, values = counts[low * width :], largest[low * width :]
+            bottom, top = max(0, -row), min(along, rows - row)
+            count = (top - bottom - 1) * width + across
+            first = level.across + (row + bottom) * width + column
+            part = level.rows[classes[n], y % TILES, x % TILES, first : first + count]
+            known, values = counts[bottom * width :], largest[bottom * width :]
             for c in range(count):
                 known[c] += part[c] != 0
                 values[c] = max(values[c], part[c])
@@ -257,24 +379,30 @@ def count_known(level: PhasedLevel, cells: Int32, i: int, j: int, along: int) ->
 
 @njit(cache=True)
 def quarter_bounds(
-    level: Int8, margin: int, cells: Int32, i: int, j: int, side: int
+    level: Int8, corners: Int32, classes: Int8, x: int, y: int
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Bounds of the sum over the samples (n, 2) in the square of shifts that begins at (i, j), and in those beside it.
+    """Bounds of the sum over the samples of a group in a square of shifts, and in those beside it, steps.
 
-    :param level: of the pyramid, for squares of edge ``side``.
-    :returns: bounds of that square and the one right of it, and of the two below, steps.
+    :param level: of the pyramid.
+    :param corners: shape (n, 2), of the group; ``classes``, shape (n,).
+    :param x: where the square begins along x, tiles from the smallest shift of the window; ``y``, along y.
+    :returns: bounds of that square and the one right of it, and of the two below.
     """
-    rows, columns = np.uint32(level.shape[0] - side), np.uint32(level.shape[1] - side)
-    beside = np.uint32(side)
-    first, right, below, both = 0, 0, 0, 0
-    for n in range(cells.shape[0]):
-        x, y = np.uint32(cells[n, 0] + i + margin), np.uint32(cells[n, 1] + j + margin)
-        if x < columns and y < rows:
-            first += level[y, x]
-            right += level[y, x + beside]
-            below += level[y + beside, x]
-            both += level[y + beside, x + beside]
-    return (first, right), (below, both)
+    rows, columns = np.uint32(level.shape[1] - TILES), np.uint32(level.shape[2] - TILES)
+    beside = np.uint32(TILES)
+    first, right, below, both, anywhere = 0, 0, 0, 0, 0
+    for n in range(corners.shape[0]):
+        c = np.uint32(classes[n])
+        if c == TOO_WIDE:
+            anywhere += TOP_STEPS
+            continue
+        column, row = np.uint32(corners[n, 0] + x + PAD), np.uint32(corners[n, 1] + y + PAD)
+        if column < columns and row < rows:
+            first += level[c, row, column]
+            right += level[c, row, column + beside]
+            below += level[c, row + beside, column]
+            both += level[c, row + beside, column + beside]
+    return (first + anywhere, right + anywhere), (below + anywhere, both + anywhere)
 
 
 @njit(cache=True)

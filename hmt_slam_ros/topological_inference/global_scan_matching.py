@@ -34,9 +34,9 @@ from hmt_slam_ros.hybrid_map.surroundings import (
     stack_poses,
 )
 from hmt_slam_ros.registration.area_to_area import MatchMode, MatchSettings, find_cells, match_areas
-from hmt_slam_ros.registration.branch_and_bound import constrain_around
 from hmt_slam_ros.registration.consistency import Agreement, count_hits_and_violations
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
+from hmt_slam_ros.registration.position_constraint import constrain_around
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 
