@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
-from benchmark.scripted import STEP, Robot, Script
+from benchmark.scripted import STEP, Robot, Script, UnboundedWork
 from benchmark.settings import Settings
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration, load_configuration
@@ -266,10 +266,9 @@ def _table_row(regime: str, world: str, drives: Sequence[ComparedDrive]) -> list
 class _UnboundedSearch(ClosureSearch):
     """A closure search that compares at one event, however much work that is: no area abstraction repeats a cut."""
 
-    @property
-    def is_exhausted(self) -> bool:
-        """Whether the work of the event is done."""
-        return False
+    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
+        super().__init__(configuration, scans)
+        self.work = UnboundedWork()
 
 
 class _UnboundedBranching(Branching):

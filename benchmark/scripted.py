@@ -29,6 +29,7 @@ from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS
 from hmt_slam_ros.messages.routing import Process
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.topological_inference.event_work import EventWork
 
 STEP = np.diag([0.02, 0.02, math.radians(0.5)]) ** 2
 """Covariance of the odometry between two keyframes."""
@@ -61,6 +62,15 @@ class Robot:
             return self
         drift = max(1, keyframes) * noise**2 * STEP
         return Robot(area, PoseGaussian(se2.compose(rebase.mean, self.pose.mean), drift))
+
+
+class UnboundedWork(EventWork):
+    """Work of an event that has no bound, where no area abstraction repeats a cut."""
+
+    @property
+    def is_exhausted(self) -> bool:
+        """False."""
+        return False
 
 
 class Script:

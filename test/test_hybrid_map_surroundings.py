@@ -9,6 +9,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import (
     GridCache,
+    GridCacheState,
     Neighborhood,
     areas_around,
     consistent_pose,
@@ -99,7 +100,8 @@ def test_the_grids_that_are_kept_take_bounded_memory(views):
     assert views.grid({0: np.zeros(3)}) is first
     for k in range(40):
         views.grid({0: np.array([0.0, 0.0, 0.05 * k])})
-    assert sum(size for _, size in views._grids._grids.values()) <= KEPT
+    assert sum(views._grids.known.values()) <= KEPT
+    assert views._grids.known.keys() == views._grids._grids.keys()
     assert views.grid({0: np.zeros(3)}) is not first
 
 
@@ -113,6 +115,40 @@ def test_a_coarse_grid_outlasts_the_grid_that_it_was_made_of(views):
     assert views.coarse_grid({0: np.zeros(3)}) is coarse
     views.clear()
     assert views.coarse_grid({0: np.zeros(3)}) is not coarse
+
+
+def test_a_restored_cache_counts_no_grid_that_was_held_and_evicts_the_same():
+    scans = {0: scan_in(box(-2.0, -2.0, 10.0, 2.0), np.zeros(3))}
+    turned = [{0: np.array([0.0, 0.0, 0.05 * k])} for k in range(12)]
+    counted = []
+
+    def make(state=None):
+        own = []
+        counted.append(own)
+        cache = GridCache(scans, GridModel(), NEAR, KEPT, own.append)
+        cache.restore(state or GridCacheState())
+        return cache
+
+    first = make()
+    for keyframes in (*turned[:6], turned[2]):
+        first.grid(keyframes)
+    first.coarse_grid(turned[3])
+    second = make(first.state)
+    assert second.state == first.state
+    assert len(counted[0]) == 6
+    counted[0].clear()
+    grids = []
+    for cache in (first, second):
+        coarse = [cache.coarse_grid(turned[3])]
+        own = [cache.grid(turned[k]) for k in (0, 2, 7, 8, 1, 9, 10, 3)]
+        grids.append([*own, *coarse, cache.coarse_grid(turned[0])])
+    for one, two in zip(*grids, strict=True):
+        np.testing.assert_array_equal(one.log_ratio, two.log_ratio)
+    assert counted[0] == counted[1]
+    assert second.state == first.state
+    assert len(first.state.grids) < 10
+    first.clear()
+    assert first.state == GridCacheState()
 
 
 def test_the_grids_that_are_kept_are_forgotten_when_they_are_needed_no_more(views):

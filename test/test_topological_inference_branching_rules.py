@@ -21,6 +21,7 @@ from hmt_slam_ros.topological_inference.branches import Parent
 from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.candidate_gating import Transition
 from hmt_slam_ros.topological_inference.closure_search import _split_heaviest
+from hmt_slam_ros.topological_inference.event_work import EventWork
 from hmt_slam_ros.topological_inference.hypothesis_changes import apply_revision, merge_areas
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
 
@@ -63,7 +64,7 @@ def make_parent(**changes):
 
 def make_branching(**search):
     branching = Branching(CONFIGURATION, Replica())
-    branching.search = SimpleNamespace(**{"begin_event": lambda: None, "tracked_area": lambda *_: None, **search})
+    branching.search = SimpleNamespace(**{"work": EventWork(), "tracked_area": lambda *_: None, **search})
     return branching
 
 

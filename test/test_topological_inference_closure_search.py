@@ -9,10 +9,11 @@ from benchmark.lattice import Lattice, LatticeScans
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map import surroundings
-from hmt_slam_ros.topological_inference import closure_search as module
+from hmt_slam_ros.topological_inference import event_work
 from hmt_slam_ros.topological_inference.area_comparison import AreaComparison
 from hmt_slam_ros.topological_inference.candidate_gating import Query
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
+from hmt_slam_ros.topological_inference.event_work import EventWork
 
 HERE = 210  # in the middle of the lattice
 SPREAD = np.diag([3.0, 3.0, 0.05]) ** 2
@@ -36,7 +37,7 @@ def finish(search, hybrid_map, comparison):
     """The result of a comparison, and what was left of it after each event before the last."""
     states = []
     while True:
-        search.begin_event()
+        search.work.begin_event()
         comparison = search.continue_comparison(hybrid_map, comparison)
         if isinstance(comparison, AreaComparison):
             return comparison, states
@@ -69,6 +70,7 @@ def test_their_maps_are_made_ahead_one_at_a_time(lattice, monkeypatch):
         finish(search, lattice, begin(search, lattice, keyframes, dict.fromkeys(range(400), keyframes.poses)))
         for _ in range(count):
             before = len(built)
+            search.work.begin_event()
             search.look_ahead(lattice)
             assert len(built) - before <= 1
         before = len(built)
@@ -83,43 +85,40 @@ def test_their_maps_are_made_ahead_one_at_a_time(lattice, monkeypatch):
     assert plain
 
 
-def count_work(monkeypatch):
-    """A list to which the number of areas that are compared, and their work, is added."""
-    done = []
-    match = module.match_areas
-
-    def match_areas(query, candidate, *given):
-        found = match(query, candidate, *given)
-        done.append(found.work + module.CELL_WORK * candidate.log_ratio.size)
-        return found
-
-    monkeypatch.setattr(module, "match_areas", match_areas)
+@pytest.fixture
+def works(monkeypatch):
+    """The work of every step, in order."""
+    done, add = [], EventWork.add
+    monkeypatch.setattr(EventWork, "add", lambda self, work: (done.append(work), add(self, work)))
     return done
 
 
-def test_a_wide_comparison_is_spread_over_events_with_the_result_of_a_single_one(lattice, monkeypatch):
-    keyframes, done = query(lattice), count_work(monkeypatch)
-    monkeypatch.setattr(module, "_EVENT_WORK", 10**15)
-    search = ClosureSearch(Configuration(), LatticeScans())
-    at_once, states = finish(search, lattice, begin(search, lattice, keyframes))
-    assert states == []
-    areas, total = len(done), sum(done)
-    done.clear()
-    budget = total // 4
-    monkeypatch.setattr(module, "_EVENT_WORK", budget)
+def test_a_wide_comparison_is_spread_over_events_with_the_result_of_a_single_one(lattice, works, monkeypatch):
+    """Maps and matches of areas, and of the places where the keyframes do not lie, are steps of their own."""
+    keyframes = query(lattice)
+    monkeypatch.setattr(event_work, "_MAX_WORK", 10**15)
     search = ClosureSearch(Configuration(), LatticeScans())
     comparison = begin(search, lattice, keyframes)
-    left, before = [len(comparison.candidates)], 0
+    at_once, states = finish(search, lattice, comparison)
+    assert states == []
+    assert search.state.negative_shares
+    assert len(works) > 2 * len(comparison.candidates)
+    total, alone = sum(works), search.state
+    works.clear()
+    budget = total // 8
+    monkeypatch.setattr(event_work, "_MAX_WORK", budget)
+    search = ClosureSearch(Configuration(), LatticeScans())
+    comparison, left, before = begin(search, lattice, keyframes), [], 0
     while not isinstance(comparison, AreaComparison):
-        search.begin_event()
+        left.append(len(comparison.candidates) + len(comparison.elsewhere))
+        search.work.begin_event()
         comparison = search.continue_comparison(lattice, comparison)
-        works, before = done[before:], len(done)
-        assert sum(works[:-1]) < budget
-        if not isinstance(comparison, AreaComparison):
-            left.append(len(comparison.candidates))
-    assert len(done) == areas
+        own, before = works[before:], len(works)
+        assert sum(own) < budget + max(own)
+    assert sum(works) == total
     assert len(left) >= 4
     assert left == sorted(left, reverse=True)
+    assert search.state == alone
     assert comparison.fits
     for one, two in zip(comparison.fits, at_once.fits, strict=True):
         assert (one.area, one.log_weight, one.mode.log_mass) == (two.area, two.log_weight, two.mode.log_mass)
@@ -128,26 +127,40 @@ def test_a_wide_comparison_is_spread_over_events_with_the_result_of_a_single_one
     assert comparison[2:] == at_once[2:]
 
 
-def test_the_hypotheses_of_an_event_share_its_work(lattice, monkeypatch):
-    done = count_work(monkeypatch)
+def test_the_hypotheses_of_an_event_share_its_work(lattice, works, monkeypatch):
     search, keyframes = ClosureSearch(Configuration(), LatticeScans()), query(lattice)
-    monkeypatch.setattr(module, "_EVENT_WORK", 1)
+    monkeypatch.setattr(event_work, "_MAX_WORK", 1)
     first, second = (begin(search, lattice, keyframes) for _ in range(2))
-    search.begin_event()
+    search.work.begin_event()
     first = search.continue_comparison(lattice, first)
-    assert search.continue_comparison(lattice, second).candidates == second.candidates
-    assert len(first.candidates) == len(second.candidates) - 1
-    assert len(done) == 1
+    assert search.continue_comparison(lattice, second).prepared is None
+    assert first.prepared == next(iter(first.candidates))
+    # The map of the query is made first, to find the candidates' entries.
+    assert all(work % event_work.CELL_WORK == 0 for work in works)
 
 
-def test_a_comparison_goes_on_without_areas_that_the_map_lost(lattice, monkeypatch):
-    monkeypatch.setattr(module, "_EVENT_WORK", 1)
-    search = ClosureSearch(Configuration(), LatticeScans())
-    comparison = search.continue_comparison(lattice, begin(search, lattice, query(lattice)))
-    (examined,) = comparison.examined
-    left = list(comparison.candidates)
-    for area in (examined.area, left[0]):
-        lattice.merge(area, left[-1], PoseGaussian(np.zeros(3), np.eye(3)))
-    found, _ = finish(search, lattice, comparison)
-    assert not {examined.area, left[0]} & found.transition.known.keys()
-    assert set(left[1:]) & found.transition.known.keys()
+def test_places_where_keyframes_do_not_lie_are_matched_for_one_of_two_hypotheses(lattice, monkeypatch):
+    monkeypatch.setattr(event_work, "_MAX_WORK", 1)
+    search, keyframes = ClosureSearch(Configuration(), LatticeScans()), query(lattice)
+    _, states = finish(search, lattice, begin(search, lattice, keyframes))
+    shares = search.state.negative_shares
+    assert any(state.negative_shares for state in states)
+    _, states = finish(search, lattice, begin(search, lattice, keyframes))
+    assert not any(state.negative_shares for state in states)
+    assert search.state.negative_shares == shares
+
+
+def test_a_comparison_goes_on_the_same_without_the_maps_that_were_made(lattice, monkeypatch):
+    monkeypatch.setattr(event_work, "_MAX_WORK", 1)
+    found = []
+    for is_resumed in (False, True):
+        search = ClosureSearch(Configuration(), LatticeScans())
+        comparison, events = begin(search, lattice, query(lattice)), 0
+        while not isinstance(comparison, AreaComparison):
+            if is_resumed:
+                state, search = search.state, ClosureSearch(Configuration(), LatticeScans())
+                search.restore(state)
+            search.work.begin_event()
+            comparison, events = search.continue_comparison(lattice, comparison), events + 1
+        found.append((events, search.state, [(fit.area, fit.log_weight) for fit in comparison.fits]))
+    assert found[0] == found[1]

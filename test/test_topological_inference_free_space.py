@@ -21,7 +21,7 @@ def compare_rooms(there, here, known=KNOWN, seen=SEEN):
         for walls, poses in ((there, KNOWN), (here, SEEN))
         for k, pose in poses.items()
     }
-    return FreeSpaceCheck(scans, Configuration()).compare(known, seen)
+    return FreeSpaceCheck(scans, Configuration()).compare(known, seen)[0]
 
 
 def test_in_the_same_room_no_wall_is_seen_through():

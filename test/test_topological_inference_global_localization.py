@@ -19,19 +19,27 @@ from hmt_slam_ros.registration.consistency import (
     WALLS_OUTLIER_RATE,
     Agreement,
 )
-from hmt_slam_ros.topological_inference import global_localization
+from hmt_slam_ros.topological_inference import event_work
+from hmt_slam_ros.topological_inference.event_work import EventWork
 from hmt_slam_ros.topological_inference.global_localization import (
     UNMAPPED_PRIOR,
     GlobalSearch,
     PoseDistribution,
     PoseHint,
     begin_search,
+    check_candidates,
     continue_search,
     is_conclusive,
     localize_globally,
+    search_region,
     summarize_localization,
 )
-from hmt_slam_ros.topological_inference.global_scan_matching import GlobalScanMatcher, PoseCandidate, RegionMatch
+from hmt_slam_ros.topological_inference.global_scan_matching import (
+    GlobalScanMatcher,
+    PoseCandidate,
+    Region,
+    RegionMatch,
+)
 
 shares = st.lists(st.floats(0.001, 1.0), min_size=1, max_size=5)
 
@@ -110,26 +118,42 @@ def test_evidence_multiplies_odds_against_unmapped_ground(pairs):
 class GivenWalls(GlobalScanMatcher):
     """Finds one candidate in every area that is searched, each with given walls."""
 
-    def __init__(self, walls, work=0, agreements=None):
-        self.walls, self.work, self.agreements = walls, work, agreements or {}
-        self.searched, self.best_shares = [], []
+    def __init__(self, walls, work=0, agreements=None, map_work=0):
+        self.walls, self.work, self.map_work, self.agreements = walls, work, map_work, agreements or {}
+        self.event, self.missing = EventWork(), set()
+        self.prepared, self.searched, self.best_shares, self.checked = [], [], [], []
 
-    def match_region(self, _hybrid_map, _poses, _before, unexamined, best_share):
+    def find_region(self, _hybrid_map, _before, unexamined):
         area = max(unexamined, key=unexamined.get)
+        return Region(area, dict.fromkeys((area, area + 1)), frozenset({area}))
+
+    def prepare_region(self, _hybrid_map, region, _before, *, whole):
+        self.prepared.append(region.reference)
+        if whole:
+            self.missing.discard(region.reference)
+        self.event.add(self.map_work)
+
+    def match_region(self, _hybrid_map, region, _poses, _before, best_share):
+        area = region.reference
         self.searched.append(area)
+        if area in self.missing:
+            return RegionMatch(None, self.work)
         self.best_shares.append(best_share)
         found = make_candidate(area)._replace(agreement=self.agreements.get(area, Agreement(0, 0, 0)))
-        return RegionMatch(frozenset({area}), frozenset({area, area + 1}), (found,), self.work)
+        return RegionMatch((found,), self.work)
 
     def check_walls(self, _hybrid_map, candidate, _poses, _before):
-        return self.walls[candidate.area]
+        self.checked.append(candidate.area)
+        return self.walls[candidate.area], self.work
 
 
 def test_walls_that_beams_pass_count_against_a_candidate_and_others_count_for_none():
     passed = Agreement(400, 360, 40)
     matcher = GivenWalls({0: Agreement(400, 400, 0), 1: passed, 2: Agreement(0, 0, 0)})
     search = GlobalSearch({}, 9, 3, {}, tuple(map(make_candidate, range(3))))
-    found = localize_globally(search, matcher, 0.01, HybridMap(), NO_CLUTTER)
+    search, is_checked = check_candidates(search, matcher, EventWork(), 0.01, map_of(3), NO_CLUTTER)
+    assert is_checked
+    found = localize_globally(search, 0.01, HybridMap(), NO_CLUTTER)
     log_ratio = WALLS_OF_MAP.log_likelihood_ratio(passed, WALLS_OUTLIER_RATE)
     assert log_ratio < -1.0
     first, second, third = found.probabilities
@@ -144,25 +168,71 @@ def map_of(areas):
     return hybrid_map
 
 
+def next_event(search, matcher, hybrid_map, first=None):
+    """The search after an event."""
+    matcher.event.begin_event()
+    return continue_search(search, matcher, hybrid_map, matcher.event, first)
+
+
 def test_an_event_searches_the_most_probable_regions_until_its_work_is_done():
-    work = global_localization._EVENT_WORK // 2
-    matcher = GivenWalls({}, work, {3: Agreement(10, 6, 0)})
+    matcher = GivenWalls({}, event_work._MAX_WORK // 2, {3: Agreement(10, 6, 0)})
     probabilities = {0: 0.05, 1: 0.1, 2: 0.2, 3: 0.4, 4: 0.15, 5: 0.1}
-    search = continue_search(begin_search(map_of(6), {9: np.zeros(3)}, 9, probabilities), matcher, map_of(6), first=1)
+    search = next_event(begin_search(map_of(6), {9: np.zeros(3)}, 9, probabilities), matcher, map_of(6), first=1)
     assert matcher.searched == [1, 3]
-    assert search.is_exhausted
     # Area 2 was merged with another one.
     hybrid_map = map_of(6)
     hybrid_map.merge(2, 3, PoseGaussian(np.zeros(3), np.eye(3)))
-    search = continue_search(search, matcher, hybrid_map, first=1)
-    assert matcher.searched == [1, 3, 4, 5]
+    search = next_event(search, matcher, hybrid_map, first=1)
+    assert matcher.searched == matcher.prepared == [1, 3, 4, 5]
     assert matcher.best_shares == [0.0, 0.0, 0.6, 0.6]
     assert list(search.unexamined) == [0]
     assert search.fitting_areas == {1, 2, 3, 4, 5, 6}
     assert [candidate.area for candidate in search.candidates] == [1, 3, 4, 5]
-    assert continue_search(search, matcher, hybrid_map).unexamined == {}
-    rest = continue_search(search, GivenWalls({}, 0), hybrid_map)
-    assert (rest.unexamined, rest.is_exhausted) == ({}, False)
+    assert next_event(search, matcher, hybrid_map).unexamined == {}
+
+
+def test_a_large_map_of_a_region_is_made_at_one_event_and_matched_at_the_next():
+    matcher = GivenWalls({}, 0, map_work=event_work._MAX_WORK)
+    search, steps = begin_search(map_of(2), {9: np.zeros(3)}, 9, {0: 0.2, 1: 0.8}), []
+    while search.unexamined:
+        search = next_event(search, matcher, map_of(2))
+        steps.append((list(matcher.prepared), list(matcher.searched), search.prepared))
+    assert steps == [([1], [], 1), ([1, 0], [1], 0), ([1, 0], [1, 0], None)]
+    matcher.missing, steps = {0}, []
+    search = begin_search(map_of(2), {9: np.zeros(3)}, 9, {0: 1.0})
+    while search.unexamined:
+        search = next_event(search, matcher, map_of(2))
+        steps.append((len(matcher.prepared) - 2, len(matcher.searched) - 2, search.is_map_missing))
+    # Its coarse map, a match that needs the whole map, and that match again.
+    assert steps == [(1, 0, False), (2, 1, False), (2, 2, False)]
+    # A kidnapping is tested at once.
+    search, work = begin_search(map_of(3), {9: np.zeros(3)}, 9, {0: 0.2, 1: 0.7, 2: 0.1}), matcher.event
+    search = search_region(search, matcher, map_of(3), work, 2)
+    assert list(search.unexamined) == [0, 1]
+    assert work.is_exhausted
+    assert search_region(search, matcher, HybridMap(), work, 2).unexamined == {}
+
+
+def test_the_walls_of_probable_candidates_are_checked_until_the_work_of_an_event_is_done():
+    passed = Agreement(400, 360, 40)
+    matcher = GivenWalls(dict.fromkeys(range(4), passed), event_work._MAX_WORK)
+    candidates = [make_candidate(area) for area in range(4)]
+    improbable = candidates[3]._replace(agreement=Agreement(400, 100, 300))
+    search, states = GlobalSearch({}, 9, 4, {}, (*candidates[:3], improbable)), []
+    while not states or not states[-1]:
+        # The area of one of them has gone meanwhile.
+        hybrid_map = map_of(4 if not states else 2)
+        search, is_checked = check_candidates(search, matcher, EventWork(), 0.01, hybrid_map, NO_CLUTTER)
+        states.append(is_checked)
+    assert (states, matcher.checked) == ([False, True], [0, 1])
+    assert [candidate.walls for candidate in search.candidates] == [passed, passed]
+    again, is_checked = check_candidates(search, matcher, EventWork(), 0.01, map_of(2), NO_CLUTTER)
+    assert is_checked
+    assert (again.candidates, matcher.checked) == (search.candidates, [0, 1])
+    none_left = EventWork()
+    none_left.add(event_work._MAX_WORK)
+    search = GlobalSearch({}, 9, 4, {}, (improbable,))
+    assert check_candidates(search, matcher, none_left, 0.01, map_of(4), NO_CLUTTER)[1]
 
 
 def test_candidates_that_were_refuted_wait_for_another_or_for_the_end():
@@ -183,7 +253,7 @@ def test_what_was_not_searched_may_match_as_well_and_the_candidate_by_chance():
         distinctiveness = (2.0 + negatives) / (2.0 * 0.01)
         weight = 0.8 / 5.0 * math.exp(there) * distinctiveness
         expected = weight / (weight + UNMAPPED_PRIOR + 0.8 * unexamined * math.exp(there))
-        found = localize_globally(search, GivenWalls({4: Agreement(0, 0, 0)}), 0.01, HybridMap(), NO_CLUTTER)
+        found = localize_globally(search, 0.01, HybridMap(), NO_CLUTTER)
         assert found.probabilities.tolist() == pytest.approx([expected])
         bounds = (expected - 1e-6, expected + 1e-6)
         conclusive = [is_conclusive(search, 0.01, HybridMap(), NO_CLUTTER, None, bound) for bound in bounds]
@@ -218,10 +288,9 @@ def test_an_initial_pose_weighs_candidates_by_their_distance_in_both_covariances
     arc = PoseGaussian(np.array([1.0, 0.5, 0.9]), np.diag([0.02, 0.01, 0.004]))
     hybrid_map.set_arc(0, 1, arc, closure=False)
     hint = PoseGaussian(np.array([0.4, 0.9, 0.5]), np.array([[0.3, 0.1, 0.0], [0.1, 0.2, 0.02], [0.0, 0.02, 0.1]]))
-    matcher = GivenWalls(dict.fromkeys(range(2), Agreement(0, 0, 0)))
     search = GlobalSearch({9: np.zeros(3)}, 9, 2, {}, tuple(map(make_candidate, range(2))))
     flat, found = (
-        localize_globally(search, matcher, 0.01, hybrid_map, NO_CLUTTER, pose_hint).probabilities
+        localize_globally(search, 0.01, hybrid_map, NO_CLUTTER, pose_hint).probabilities
         for pose_hint in (None, PoseHint(9, 0, hint))
     )
     measured = make_candidate(0).mode.measured

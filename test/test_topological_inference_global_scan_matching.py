@@ -11,6 +11,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import GridCache, Neighborhood
 from hmt_slam_ros.registration.area_to_area import MatchSettings
+from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.registration.likelihood_grid import GridModel
 from hmt_slam_ros.topological_inference import global_scan_matching
 from hmt_slam_ros.topological_inference.global_scan_matching import FreeSpaceCheck, GlobalScanMatcher, region_around
@@ -54,11 +55,13 @@ def match_all(matcher, hybrid_map, poses, before, areas):
     found, unexamined = [], dict.fromkeys(areas, 1.0 / len(areas))
     while unexamined:
         best_share = max((fit.agreement.matched_share for fit in found), default=0.0)
-        region = matcher.match_region(hybrid_map, poses, before, unexamined, best_share)
-        assert region.areas
-        assert region.work > 0
-        found += region.candidates
-        unexamined = {area: p for area, p in unexamined.items() if area not in region.areas}
+        region = matcher.find_region(hybrid_map, before, unexamined)
+        assert region.reference in region.own_areas
+        matcher.prepare_region(hybrid_map, region, before, whole=True)
+        match = matcher.match_region(hybrid_map, region, poses, before, best_share)
+        assert match.work > 0
+        found += match.candidates
+        unexamined = {area: p for area, p in unexamined.items() if area not in region.own_areas}
     return found
 
 
@@ -121,13 +124,15 @@ def test_wrong_poses_violate_walls(query, match):
     """At the pose found, no beam passes a wall; half a meter aside, some would."""
     hybrid_map, poses, scans = query
     best = max(match([0]), key=lambda fit: fit.mode.log_mass)
-    found = make_matcher(scans).check_walls(hybrid_map, best, poses, 1000)
+    found, work = make_matcher(scans).check_walls(hybrid_map, best, poses, 1000)
+    beams = sum(len(scans[k].points) for k in (*range(12), *poses) if k not in hybrid_map.keyframes(1))
+    assert work == global_scan_matching._BEAM_WORK * beams
     assert found.on_surface > 100
     assert found.in_free_space == 0
     aside = PoseGaussian(best.mode.pose.mean + np.array([0.5, 0.5, 0.0]), best.mode.pose.covariance)
     moved = best._replace(mode=best.mode._replace(pose=aside))
-    assert make_matcher(scans).check_walls(hybrid_map, moved, poses, 1000).in_free_space > 20
-    assert make_matcher(scans).check_walls(hybrid_map, best, poses, 0).samples == 0
+    assert make_matcher(scans).check_walls(hybrid_map, moved, poses, 1000)[0].in_free_space > 20
+    assert make_matcher(scans).check_walls(hybrid_map, best, poses, 0) == (Agreement(0, 0, 0), 0)
 
 
 def test_only_the_given_areas_are_searched(match):

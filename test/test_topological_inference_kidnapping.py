@@ -51,6 +51,16 @@ def spawn(rooms, evidence, first=FAR, hall=2):
     return spawn_kidnapped_hypothesis(branching, replace(parent, state=state))
 
 
+def search_through(branching, parent):
+    """The children of a lost hypothesis at the event at which its search ends."""
+    while True:
+        branching.begin_event()
+        branches = relocalization.update_relocalization(branching, parent)
+        if branches.pose_distribution is not None:
+            return branches
+        parent = replace(parent, state=branches.children[0].state)
+
+
 def since(child):
     """The keyframe since which the robot is lost; None where it is not."""
     return child.state.localization.since if child.state.is_lost else None
@@ -84,9 +94,9 @@ def test_two_searches_with_the_same_result_relocalize_it():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
     lost = Lost(newest[0], tracked_pose=PoseInArea(2, newest[0], np.zeros(3)), counted_evidence=None)
     state = replace(parent.state, localization=lost)
-    (still,) = relocalization.update_relocalization(branching, replace(parent, state=state)).children
+    (still,) = search_through(branching, replace(parent, state=state)).children
     assert still.state.localization.candidate.area == 0
-    branches = relocalization.update_relocalization(branching, replace(parent, state=still.state))
+    branches = search_through(branching, replace(parent, state=still.state))
     _, found = branches.children
     assert relocalization.accept_relocalization(branches).children == [found]
     assert isinstance(found.state.localization, Tracking)
@@ -221,7 +231,7 @@ def test_a_false_alarm_raises_the_probability_of_the_tracked_pose_only(at, found
     for probability in (0.0, 0.4):
         stay = FalseAlarm(PoseInArea(0, newest[0], np.array([at, 0.0, 0.0])), probability)
         state = replace(parent.state, localization=Lost(newest[0], stay))
-        distribution = relocalization.update_relocalization(branching, replace(parent, state=state)).pose_distribution
+        distribution = search_through(branching, replace(parent, state=state)).pose_distribution
         branches[probability] = max(
             p for p, fit in zip(distribution.probabilities, distribution.candidates, strict=True) if fit.area == 0
         )

@@ -9,7 +9,7 @@ from worlds import box, drive, scan_in
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.registration.area_to_area import MatchSettings
 from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid
-from hmt_slam_ros.topological_inference.place_recognition import NegativeSample, PerceptualAliasing, best_shares
+from hmt_slam_ros.topological_inference.place_recognition import NegativeSample, PerceptualAliasing, best_share
 
 MODEL, SETTINGS = GridModel(), MatchSettings(temper=0.3)
 PATH = drive((-4.0, 0.0), (4.0, 0.0))
@@ -38,26 +38,31 @@ def elsewhere(walls, seed):
     return NegativeSample(make_grid(walls, PATH, seed), se2.between(PATH[0], PATH[len(PATH) // 2]))
 
 
+def share_of(query, place):
+    share, work = best_share(query, place, SETTINGS)
+    assert (work > 0) == bool(len(query.points))
+    return share
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_corridor_fits_into_the_same_one_better_than_into_others_and_there_better_than_a_room(seed):
-    query, places = make_grid(corridor(seed), PATH[6:11], 50), [elsewhere(corridor(100 + seed), 200)]
-    (same,) = best_shares(query, [elsewhere(corridor(seed), 300)], SETTINGS)
-    (other,) = best_shares(query, places, SETTINGS)
-    (room,) = best_shares(make_grid(ROOM, PATH[6:11], 50), places, SETTINGS)
+    query, place = make_grid(corridor(seed), PATH[6:11], 50), elsewhere(corridor(100 + seed), 200)
+    same, other = share_of(query, elsewhere(corridor(seed), 300)), share_of(query, place)
+    room = share_of(make_grid(ROOM, PATH[6:11], 50), place)
     assert same > 0.95
     assert room < 0.6 < other < same
 
 
 def test_both_ways_through_a_corridor_are_tried():
     there, back = corridor(1), drive((4.0, 0.0), (1.5, 0.0))
-    (forth,) = best_shares(make_grid(there, PATH[6:11], 50), [elsewhere(there, 200)], SETTINGS)
-    (turned,) = best_shares(make_grid(there, back, 50), [elsewhere(there, 200)], SETTINGS)
+    forth = share_of(make_grid(there, PATH[6:11], 50), elsewhere(there, 200))
+    turned = share_of(make_grid(there, back, 50), elsewhere(there, 200))
     assert min(forth, turned) > 0.7
 
 
 def test_without_surfaces_nothing_matches():
     nothing = build_area_grid([], np.zeros((0, 3)), MODEL)
-    assert best_shares(nothing, [elsewhere(corridor(0), 200)], SETTINGS) == [0.0]
+    assert share_of(nothing, elsewhere(corridor(0), 200)) == 0.0
 
 
 def test_a_rare_match_is_distinctive():

@@ -20,7 +20,7 @@ from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.simulation.scenario import START
-from hmt_slam_ros.topological_inference import global_localization
+from hmt_slam_ros.topological_inference import event_work
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 from hmt_slam_ros.topological_inference.tsbi import TsbiState
 
@@ -195,7 +195,7 @@ def test_an_arc_that_has_no_information_is_distinguished_from_the_least_certain_
 
 def test_a_search_that_is_saved_amid_goes_on_as_it_would_have(office, monkeypatch, tmp_path):
     """In a building that it does not know, with one small region at each event, so that it takes several."""
-    monkeypatch.setattr(global_localization, "_EVENT_WORK", 1)
+    monkeypatch.setattr(event_work, "_MAX_WORK", 1)
     records = iter(open_log("sim:grid,seed=4,size=0.7").records())
     configuration = replace(Configuration(), tsbi=replace(Configuration().tsbi, local_reach=1.0))
     run = LockStepRun(configuration, state=office.state)

@@ -15,8 +15,9 @@ from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
 from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
-from hmt_slam_ros.topological_inference import global_localization, kidnapping, relocalization
+from hmt_slam_ros.topological_inference import event_work, kidnapping, relocalization
 from hmt_slam_ros.topological_inference.branches import Branches, Parent
+from hmt_slam_ros.topological_inference.event_work import EventWork
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseDistribution, PoseHint
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
@@ -145,9 +146,11 @@ class GivenSearch(SimpleNamespace):
     def __init__(self, events=1, **given):
         super().__init__(first_areas=[], remaining=events, **given)
         self.search = SimpleNamespace(
-            is_exhausted=False,
+            work=EventWork(),
+            check_candidates=lambda _map, search, _clutter, _hint=None: (search, True),
             begin_global_search=self.begin,
             continue_global_search=self.go_on,
+            search_now=lambda hybrid_map, search, area, _clutter: self.go_on(hybrid_map, search, area),
             is_conclusive=lambda _map, _search, _clutter, _hint=None: self.remaining == 0,
         )
 
@@ -225,12 +228,19 @@ def test_a_search_goes_on_with_its_keyframes_until_it_is_over():
 
 
 class ExhaustingSearch(GivenSearch):
-    """A search that takes the work of every event, and leaves an area where something fits."""
+    """A search that takes the work of an event, leaves an area where something fits, and checks walls at the next."""
+
+    def __init__(self, **given):
+        super().__init__(**given)
+        self.search.check_candidates = self.check
 
     def go_on(self, hybrid_map, search, first=None):
         search = super().go_on(hybrid_map, search, first)
-        left = {3: 0.1} if search.candidates else {}
-        return replace(search, event_work=global_localization._EVENT_WORK, unexamined=left)
+        self.search.work.add(event_work._MAX_WORK)
+        return replace(search, unexamined={3: 0.1} if search.candidates else {})
+
+    def check(self, _hybrid_map, search, _clutter, _hint=None):
+        return search, not (search.candidates and self.search.work.is_exhausted)
 
 
 @pytest.mark.parametrize(("probability", "refuted"), [(0.9, 0), (0.5, 1)])
@@ -240,14 +250,15 @@ def test_candidates_are_tested_at_the_event_after_a_search_that_took_the_work(pr
     branching, parent = ExhaustingSearch(options=OPTIONS, found=distribution(pair)), make_parent(Lost(21))
     (child,) = (found := relocalization.update_relocalization(branching, parent)).children
     assert not found.closures_searched
-    assert child.state.localization.search.is_exhausted
+    assert child.state.localization.search.candidates
+    branching.search.work.begin_event()
     (child,) = relocalization.update_relocalization(branching, replace(parent, state=child.state)).children
     lost = child.state.localization
     assert len(branching.first_areas) == 1
     if not refuted:
         assert (lost.search, lost.candidate.area) == (None, 1)
         return
-    assert (lost.search.refuted, lost.search.is_exhausted, lost.candidate) == (1, False, None)
+    assert (lost.search.refuted, lost.candidate) == (1, None)
     branching.remaining = 2
     (child,) = relocalization.update_relocalization(branching, replace(parent, state=child.state)).children
     assert len(branching.first_areas) == 2
@@ -262,7 +273,7 @@ def test_a_search_without_candidates_ends_at_once():
 
 def test_a_search_waits_at_an_event_whose_work_is_done():
     branching, parent = GivenSearch(options=OPTIONS, found=distribution()), make_parent(Lost(21))
-    branching.search.is_exhausted = True
+    branching.search.work.add(event_work._MAX_WORK)
     (child,) = relocalization.update_relocalization(branching, parent).children
     assert child.state is parent.state
     assert branching.first_areas == []

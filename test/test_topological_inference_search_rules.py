@@ -41,16 +41,18 @@ def test_walls_are_tested_between_keyframes_within_twelve_meters_of_each_other(m
         return np.array([7, 2]) if len(counted) == 1 else np.array([30, 1])
 
     monkeypatch.setattr(module, "_count_in_map", count)
-    check = FreeSpaceCheck({k: f"scan {k}" for k in (*known, *query)}, Configuration())
-    assert check.compare(known, query) == Agreement(40, 37, 3)
+    scans_by_keyframe = {k: SimpleNamespace(points=np.zeros((10 + k, 2))) for k in (*known, *query)}
+    check = FreeSpaceCheck(scans_by_keyframe, Configuration())
+    beams = sum(10 + k for k in (0, 1, *query))
+    assert check.compare(known, query) == (Agreement(40, 37, 3), module._BEAM_WORK * beams)
     (map_scans, map_poses, scans, poses), (*_, back_scans, back_poses) = counted
-    assert map_scans == back_scans == ["scan 0", "scan 1"]
-    assert scans == ["scan 8", "scan 9", "scan 10"]
+    assert map_scans == back_scans == [scans_by_keyframe[k] for k in (0, 1)]
+    assert scans == [scans_by_keyframe[k] for k in (8, 9, 10)]
     middle = np.array([20.8, -3.4, 0.0])
     np.testing.assert_allclose(map_poses, [known[k] - middle for k in (0, 1)])
     np.testing.assert_allclose(poses, [query[k] - middle for k in (8, 9, 10)])
     np.testing.assert_array_equal(back_poses, map_poses)
-    assert check.compare({}, query) == check.compare(known, {}) == Agreement(0, 0, 0)
+    assert check.compare({}, query) == check.compare(known, {}) == (Agreement(0, 0, 0), 0)
 
 
 def test_the_middle_of_the_query_is_bounded_by_the_radius_and_its_farthest_keyframe():
@@ -83,14 +85,15 @@ def test_matches_count_in_the_areas_that_are_searched_alone(monkeypatch):
         np.zeros(2), 0.1, np.zeros((9, 9)), np.zeros((18, 18), np.float32), np.zeros((9, 9), bool), rng.random((70, 2))
     )
     surface = LogRatioGrid(grid.log_ratio, grid.origin, grid.cell)
-    cache = SimpleNamespace(coarse_grid=lambda _known: surface, grid=lambda _known: grid)
+    cache = SimpleNamespace(
+        coarse_grid=lambda _known: surface, grid=lambda _known: grid, holds_grid=lambda _known: True
+    )
     known = {1: np.array([0.0, 0.0, 0.3]), 2: np.array([5.0, 1.0, 0.2]), 3: np.array([9.0, 3.0, 0.1])}
     positions = np.array([[0.0, 0.0], [5.0, 1.0], [9.0, 3.0]])
     matcher = GlobalScanMatcher(cache, None, MatchSettings(temper=0.1, margin=2.0), 1.5, 6.0)
     search = (known, np.array([2, 3, 2]), grid, {7: np.zeros(3)}, {2}, 0.8)
     found, work = matcher._match_keyframes(*search)
-    # A cell of the map counts as twenty samples.
-    assert work == 7 + 20 * 81
+    assert work == 7
     assert [(each.area, each.mode) for each in found] == [(2, modes[0]), (2, modes[3])]
     sparse_query, given_surface, back, prior, settings, bounds, constraint = searched[0]
     assert matched[0][1] is grid
@@ -112,10 +115,12 @@ def test_matches_count_in_the_areas_that_are_searched_alone(monkeypatch):
     matcher._match_keyframes(*search[:2], many, *search[3:])
     np.testing.assert_array_equal(searched[1][0].points, many.points[::7])
     assert searched[1][4].temper == pytest.approx(0.7)
+    cache.holds_grid = lambda _: False
+    assert matcher._match_keyframes(*search) == (None, 7)
     # Where nothing fits, no map is built.
     cache.grid = None
     monkeypatch.setattr(module, "find_cells", lambda *_: SearchCells(np.zeros((0, 3), np.int64), *np.zeros((2, 0)), 9))
-    assert matcher._match_keyframes(*search) == ([], 9 + 20 * 81)
+    assert matcher._match_keyframes(*search) == ([], 9)
 
 
 @pytest.mark.parametrize("lost", [(), (1,), (0, 1)])

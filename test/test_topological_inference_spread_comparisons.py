@@ -13,7 +13,7 @@ from hmt_slam_ros.messages.messages import AreaEvent
 from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter
-from hmt_slam_ros.topological_inference import closure_search
+from hmt_slam_ros.topological_inference import event_work
 from hmt_slam_ros.topological_inference import tsbi as module
 from hmt_slam_ros.topological_inference.branches import Branches, Parent
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState, Lost, Tracking
@@ -24,8 +24,8 @@ WORLD = "sim:ring,seed=1,size=0.7"
 
 @pytest.fixture(autouse=True)
 def _small_budget(monkeypatch):
-    """Let an event compare keyframes with one area at most, and the next one branch."""
-    monkeypatch.setattr(closure_search, "_EVENT_WORK", 1)
+    """Let an event make the map of one area at most, or compare keyframes with it."""
+    monkeypatch.setattr(event_work, "_MAX_WORK", 1)
 
 
 def newest_hypotheses(run):
@@ -43,7 +43,7 @@ def test_the_loop_closes_and_a_saved_comparison_goes_on_as_it_would_have(tmp_pat
     run = LockStepRun(Configuration())
     for record in records:
         run.process_record(record)
-        if any(ongoing.examined for ongoing in comparisons(run)):
+        if any(ongoing.prepared is not None for ongoing in comparisons(run)):
             break
     assert comparisons(run)
     writer = FolderWriter(tmp_path)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmark.scripted import UnboundedWork
 from benchmark.simulated.truth import RADIUS, TOLERANCE, Pose, Truth
 from hmt_slam_ros import composition
 from hmt_slam_ros.configuration import Configuration
@@ -119,13 +120,9 @@ class _ObservedSearch(ClosureSearch):
 
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan], *, is_bounded: bool) -> None:
         super().__init__(configuration, scans)
-        self._is_bounded = is_bounded
+        if not is_bounded:
+            self.work = UnboundedWork()
         self._last: _Comparison | None = None
-
-    @property
-    def is_exhausted(self) -> bool:
-        """As of the base class, where the work of an event is bounded."""
-        return self._is_bounded and super().is_exhausted
 
     @property
     def views(self) -> GridCache:

@@ -6,11 +6,12 @@ A parallel corridor behind a wall is therefore another place.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -204,46 +205,120 @@ def consistent_pose(
     return pose if agrees else belief.mean
 
 
+class KnownGrid(NamedTuple):
+    """A grid that a cache holds.
+
+    :ivar key: digest of its keyframes and their poses.
+    :ivar size: of the grid, bytes.
+    """
+
+    key: int
+    size: int
+
+
+@dataclass(frozen=True)
+class GridCacheState:
+    """Which grids a cache holds, the least recently used first. Those of a restored cache are made when needed.
+
+    :ivar grids: those of area grids.
+    :ivar coarse_grids: those of coarse grids.
+    """
+
+    grids: tuple[KnownGrid, ...] = ()
+    coarse_grids: tuple[KnownGrid, ...] = ()
+
+
 class _RecentGrids(Generic[Grid]):
     """Grids of keyframes at poses, of which the least recently used are evicted.
 
-    :param max_bytes: their size, bytes; the newest one is kept in any case.
+    :ivar known: {key: size, bytes} of those that are held, or were when the cache was saved.
     """
 
     def __init__(self, max_bytes: int) -> None:
+        """:param max_bytes: their size, bytes; the newest one is kept in any case."""
         self._max_bytes = max_bytes
-        self._grids: OrderedDict[bytes, tuple[Grid, int]] = OrderedDict()
+        self.known: OrderedDict[int, int] = OrderedDict()
+        self._grids: dict[int, Grid] = {}
 
     def clear(self) -> None:
+        self.known.clear()
         self._grids.clear()
 
-    def get(self, keyframes: Mapping[int, Pose], build: Callable[[Mapping[int, Pose]], tuple[Grid, int]]) -> Grid:
-        """The grid of the keyframes; ``build`` makes it, and says its size, bytes."""
-        key = np.array(list(keyframes), dtype=np.int64).tobytes() + stack_poses(keyframes).tobytes()
-        if key not in self._grids:
-            self._grids[key] = build(keyframes)
-            size = sum(own for _, own in self._grids.values())
-            while size > self._max_bytes and len(self._grids) > 1:
-                size -= self._grids.popitem(last=False)[1][1]
-        self._grids.move_to_end(key)
-        return self._grids[key][0]
+    def get(
+        self,
+        keyframes: Mapping[int, Pose],
+        build: Callable[[Mapping[int, Pose]], tuple[Grid, int]],
+        rebuild: Callable[[Mapping[int, Pose]], tuple[Grid, int]],
+    ) -> Grid:
+        """The grid of the keyframes; ``build`` makes it, and says its size, bytes.
+
+        :param rebuild: makes a grid again that was held when the cache was saved.
+        """
+        key = _key(keyframes)
+        if key not in self.known:
+            self._grids[key], self.known[key] = build(keyframes)
+            size = sum(self.known.values())
+            while size > self._max_bytes and len(self.known) > 1:
+                evicted, own = self.known.popitem(last=False)
+                self._grids.pop(evicted, None)
+                size -= own
+        elif key not in self._grids:
+            self._grids[key], _ = rebuild(keyframes)
+        self.known.move_to_end(key)
+        return self._grids[key]
+
+
+def _key(keyframes: Mapping[int, Pose]) -> int:
+    """A digest of keyframes and their poses, of 48 bits."""
+    content = np.array(list(keyframes), dtype=np.int64).tobytes() + stack_poses(keyframes).tobytes()
+    return int.from_bytes(hashlib.blake2b(content, digest_size=6).digest())
+
+
+def _ignore(_: int) -> None:
+    """Count nothing."""
+
+
+def _coarse_part(grid: AreaGrid) -> tuple[LogRatioGrid, int]:
+    """The log-ratios of a grid, and their size, bytes."""
+    return LogRatioGrid(grid.log_ratio, grid.origin, grid.cell), grid.log_ratio.nbytes
 
 
 class GridCache:
     """Grids and places, built from the keyframes' scans. The least recently used grids are evicted."""
 
     def __init__(
-        self, scans: Mapping[int, Scan], model: GridModel, neighborhood: Neighborhood, max_bytes: int = _CACHE_BYTES
+        self,
+        scans: Mapping[int, Scan],
+        model: GridModel,
+        neighborhood: Neighborhood,
+        max_bytes: int = _CACHE_BYTES,
+        count_cells: Callable[[int], None] = _ignore,
     ) -> None:
         """:param scans: {keyframe: scan}, which may grow.
 
         :param max_bytes: size of the cached grids, bytes.
+        :param count_cells: is called with the number of cells of every grid that is built because it was not held. It
+            is not for those that were held when the cache was saved: a restored run counts what the other one counts.
         """
         self._scans = scans
         self._model = model
         self._neighborhood = neighborhood
+        self._count_cells = count_cells
         self._grids = _RecentGrids[AreaGrid](max_bytes)
         self._coarse_grids = _RecentGrids[LogRatioGrid](_COARSE_CACHE_BYTES)
+
+    @property
+    def state(self) -> GridCacheState:
+        """Which grids are held."""
+        return GridCacheState(
+            tuple(KnownGrid(*item) for item in self._grids.known.items()),
+            tuple(KnownGrid(*item) for item in self._coarse_grids.known.items()),
+        )
+
+    def restore(self, state: GridCacheState) -> None:
+        """Hold the grids of a saved state."""
+        self._grids.known.update(state.grids)
+        self._coarse_grids.known.update(state.coarse_grids)
 
     def clear(self) -> None:
         """Drop all grids."""
@@ -252,19 +327,28 @@ class GridCache:
 
     def grid(self, keyframes: Mapping[int, Pose]) -> AreaGrid:
         """What the keyframes saw, placed at the given poses."""
-        return self._grids.get(keyframes, self._build)
+        return self._grids.get(keyframes, self._build, self._rebuild)
+
+    def holds_grid(self, keyframes: Mapping[int, Pose]) -> bool:
+        """Whether :meth:`grid` is held."""
+        return _key(keyframes) in self._grids.known
 
     def _build(self, keyframes: Mapping[int, Pose]) -> tuple[AreaGrid, int]:
+        grid, size = self._rebuild(keyframes)
+        self._count_cells(grid.log_ratio.size)
+        return grid, size
+
+    def _rebuild(self, keyframes: Mapping[int, Pose]) -> tuple[AreaGrid, int]:
         grid = build_area_grid([self._scans[k] for k in keyframes], stack_poses(keyframes), self._model)
         return grid, grid.nbytes
 
     def coarse_grid(self, keyframes: Mapping[int, Pose]) -> LogRatioGrid:
         """The log-ratios of :meth:`grid`, which take a sixth of its memory and outlast it."""
-        return self._coarse_grids.get(keyframes, self._build_coarse)
-
-    def _build_coarse(self, keyframes: Mapping[int, Pose]) -> tuple[LogRatioGrid, int]:
-        grid = self.grid(keyframes)
-        return LogRatioGrid(grid.log_ratio, grid.origin, grid.cell), grid.log_ratio.nbytes
+        return self._coarse_grids.get(
+            keyframes,
+            lambda poses: _coarse_part(self.grid(poses)),
+            lambda poses: _coarse_part(self._rebuild(poses)[0]),
+        )
 
     def static_points(self, keyframes: Mapping[int, Pose]) -> Float64:
         """Surface points of the keyframes that none of them sees through, shape (n, 2), m."""

@@ -174,18 +174,20 @@ def find_cells(
 
 def best_pose(
     query: AreaGrid, candidate: AreaGrid, prior: PoseGaussian, settings: MatchSettings
-) -> tuple[Float64, float] | None:
+) -> tuple[tuple[Float64, float] | None, int]:
     """The peak ``candidate_T_query`` of the heaviest mode of :func:`match_areas`, and its log-mass; None without modes.
 
     It costs a fraction of the mode with its covariance.
+
+    :returns: beside that, the number of samples that were looked up for the search.
     """
-    result, _ = _search(query, candidate, prior, settings)
+    result, work = _search(query, candidate, prior, settings)
     if result is None:
-        return None
+        return None, work
     labels, totals = _cluster(result)
     inside = labels == totals.argmax()
     peak = _find_peak(result.problem, result.masses[inside], result.poses[inside])
-    return se2.compose(peak, se2.inverse(result.problem.to_middle.mean)), float(totals.max())
+    return (se2.compose(peak, se2.inverse(result.problem.to_middle.mean)), float(totals.max())), work
 
 
 def _search(

@@ -74,8 +74,10 @@ class OngoingComparison:
     :ivar kind: of a cut, of a recheck with all areas that the arcs admit, or of a retry with some of them.
     :ivar candidates: {area: its prior} of those that were not examined yet, the most probable first.
     :ivar skipped: {area: bound on its probability} of those that are not examined.
-    :ivar elsewhere: some areas in which the keyframes surely do not lie.
+    :ivar elsewhere: some areas in which the keyframes surely do not lie, without those that were tried.
     :ivar examined: what was found in the others.
+    :ivar negative_shares: matched shares in those that were tried.
+    :ivar prepared: the area whose map was made at an earlier step, and which is matched next; else None.
     """
 
     query: Query
@@ -85,3 +87,5 @@ class OngoingComparison:
     skipped: Mapping[int, float]
     elsewhere: tuple[int, ...]
     examined: tuple[ExaminedArea, ...] = ()
+    negative_shares: tuple[float, ...] = ()
+    prepared: int | None = None

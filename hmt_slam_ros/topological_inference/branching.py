@@ -177,7 +177,7 @@ class Branching:
     def begin_event(self) -> None:
         """Begin an event, in which hypotheses share its work, and the numbers of new areas with the same keyframes."""
         self._new_areas = {}
-        self.search.begin_event()
+        self.search.work.begin_event()
 
     def reweight_by_known_ground(self, parent: Parent, pose: Float64, points: Float64, keyframe: int) -> Parent:
         """The hypothesis with the evidence of the newest scan for the known ground around it.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import (
     AreaPlace,
     GridCache,
+    GridCacheState,
     Neighborhood,
     containing_area,
     keyframe_positions,
@@ -43,17 +45,19 @@ from hmt_slam_ros.topological_inference.candidate_gating import (
     entry_prior,
     transition_model,
 )
+from hmt_slam_ros.topological_inference.event_work import CELL_WORK, EventWork
 from hmt_slam_ros.topological_inference.global_localization import (
     GlobalSearch,
     PoseDistribution,
     PoseHint,
     begin_search,
+    check_candidates,
     continue_search,
     is_conclusive,
     localize_globally,
+    search_region,
 )
 from hmt_slam_ros.topological_inference.global_scan_matching import (
-    CELL_WORK,
     FreeSpaceCheck,
     GlobalScanMatcher,
     query_bounds,
@@ -63,7 +67,7 @@ from hmt_slam_ros.topological_inference.place_recognition import (
     NegativeSample,
     PerceptualAliasing,
     ScanDescriptors,
-    best_shares,
+    best_share,
 )
 
 Pose = Float64
@@ -74,8 +78,16 @@ _OLD_EVENTS = 30
 _OLD_STEP = 20
 """Keyframe events between two changes of that known ground, so that its grid stays cached."""
 
-_EVENT_WORK = 40_000_000
-"""Work after which an event begins no further comparison or search: samples looked up, about 40 ms."""
+
+class PlaceAhead(NamedTuple):
+    """A place in which keyframes do not lie, whose map is made ahead.
+
+    :ivar area: the area.
+    :ivar excluded: areas that its map leaves out.
+    """
+
+    area: int
+    excluded: frozenset[int]
 
 
 @dataclass(frozen=True)
@@ -84,10 +96,16 @@ class SearchState:
 
     :ivar negative_shares: matched shares of keyframes in places where they do not lie, the latest.
     :ivar newest_sampled: the newest keyframe of the last sample, -1 before the first.
+    :ivar place_maps: the maps that comparisons hold: their work does not count again.
+    :ivar region_maps: the maps that global localization holds.
+    :ivar places_ahead: places whose maps are made at events without other work, the last one first.
     """
 
     negative_shares: tuple[float, ...] = ()
     newest_sampled: int = -1
+    place_maps: GridCacheState = field(default_factory=GridCacheState)
+    region_maps: GridCacheState = field(default_factory=GridCacheState)
+    places_ahead: tuple[PlaceAhead, ...] = ()
 
 
 class ClosureSearch:
@@ -95,6 +113,7 @@ class ClosureSearch:
 
     :ivar gating: the areas that the arcs admit.
     :ivar submap_radius: the areas that count as around another.
+    :ivar work: of the event, which comparisons and searches share.
     """
 
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan]) -> None:
@@ -105,10 +124,11 @@ class ClosureSearch:
         self.submap_radius = Neighborhood(options.local_sigma, options.local_reach)
         self._settings = MatchSettings.from_options(options)
         self._model = GridModel.from_configuration(configuration)
-        self._grid_cache = GridCache(scans, self._model, self.submap_radius)
+        self.work = EventWork()
+        self._grid_cache = GridCache(scans, self._model, self.submap_radius, count_cells=self._count_cells)
         self._aliasing = PerceptualAliasing(options.aliasing_prior)
         self._descriptors = ScanDescriptors(scans)
-        self._whole_map_cache = GridCache(scans, self._model, self.submap_radius)
+        self._whole_map_cache = GridCache(scans, self._model, self.submap_radius, count_cells=self._count_cells)
         self._global_matcher = GlobalScanMatcher(
             self._whole_map_cache,
             FreeSpaceCheck(scans, configuration),
@@ -117,18 +137,29 @@ class ClosureSearch:
             options.local_reach,
         )
         self._newest_sampled = -1
-        self._event_work = 0
-        self._look_ahead_queue: list[tuple[int, Collection[int]]] = []
+        self._places_ahead: list[PlaceAhead] = []
 
     @property
     def state(self) -> SearchState:
         """What was learned."""
-        return SearchState(tuple(self._aliasing.negative_shares), self._newest_sampled)
+        return SearchState(
+            tuple(self._aliasing.negative_shares),
+            self._newest_sampled,
+            self._grid_cache.state,
+            self._whole_map_cache.state,
+            tuple(self._places_ahead),
+        )
 
     def restore(self, state: SearchState) -> None:
         """Start from a saved state."""
         self._aliasing.add_negatives(state.negative_shares)
         self._newest_sampled = state.newest_sampled
+        self._grid_cache.restore(state.place_maps)
+        self._whole_map_cache.restore(state.region_maps)
+        self._places_ahead = list(state.places_ahead)
+
+    def _count_cells(self, cells: int) -> None:
+        self.work.add(CELL_WORK * cells)
 
     def forget_scans(self) -> None:
         """Drop what was computed from scans, of which some have changed."""
@@ -213,7 +244,7 @@ class ClosureSearch:
         within, unexamined, elsewhere = self.gating.classify_areas(hybrid_map, area, query, excluded)
         if kind == "retry":
             within, unexamined = {known: prior for known, prior in within.items() if known in only}, {}
-        self._look_ahead_queue = [(other, excluded) for other in elsewhere if within]
+        self._places_ahead = [PlaceAhead(other, frozenset(excluded)) for other in elsewhere if within]
         candidates = self.gating.candidates(hybrid_map, query, compared, within)
         ranked = sorted(candidates, key=lambda known: (-candidates[known].max_probability, known))
         return OngoingComparison(
@@ -225,15 +256,6 @@ class ClosureSearch:
             tuple(elsewhere),
         )
 
-    def begin_event(self) -> None:
-        """Begin an event, whose comparisons and searches share its work."""
-        self._event_work = 0
-
-    @property
-    def is_exhausted(self) -> bool:
-        """Whether the work of the event is done, after which nothing else begins."""
-        return self._event_work >= _EVENT_WORK
-
     def continue_comparison(
         self, hybrid_map: HybridMap, comparison: OngoingComparison
     ) -> OngoingComparison | AreaComparison:
@@ -241,39 +263,68 @@ class ClosureSearch:
 
         Candidates that the map lacks by now are dropped.
         """
-        candidates = {known: c for known, c in comparison.candidates.items() if hybrid_map.has_area(known)}
-        examined = [one for one in comparison.examined if hybrid_map.has_area(one.area)]
-        while candidates and not self.is_exhausted:
-            known = next(iter(candidates))
-            examined.append(self._examine(hybrid_map, known, candidates.pop(known), comparison.excluded))
-        comparison = replace(comparison, candidates=candidates, examined=tuple(examined))
-        if candidates or self.is_exhausted:
-            return comparison
-        return self._conclude(hybrid_map, comparison)
+        comparison = replace(
+            comparison,
+            candidates={known: c for known, c in comparison.candidates.items() if hybrid_map.has_area(known)},
+            examined=tuple(one for one in comparison.examined if hybrid_map.has_area(one.area)),
+            elsewhere=tuple(area for area in comparison.elsewhere if hybrid_map.has_area(area)),
+        )
+        while (area := self._next_area(comparison)) is not None and not self.work.is_exhausted:
+            if comparison.prepared != area:
+                self._grid_cache.place(hybrid_map, area, comparison.excluded)
+                comparison = replace(comparison, prepared=area)
+            elif area in comparison.candidates:
+                comparison = self._examine(hybrid_map, comparison, area)
+            else:
+                comparison = self._sample_negative(hybrid_map, comparison, area)
+        return self._conclude(hybrid_map, comparison) if area is None else comparison
 
-    def _examine(
-        self, hybrid_map: HybridMap, known: int, candidate: AreaCandidate, excluded: Collection[int]
-    ) -> ExaminedArea:
-        """The comparison with one area."""
-        place = self._grid_cache.place(hybrid_map, known, excluded)
-        self._event_work += CELL_WORK * place.grid.log_ratio.size
-        entry = self._entry_probability(place, candidate)
-        if entry.probability == 0.0:
-            return ExaminedArea(known, candidate.prior, entry)
-        modes = self._modes(place, candidate)
-        if modes is None:
-            return ExaminedArea(known, candidate.prior, entry, is_pending=True)
-        points = self._grid_cache.grid(candidate.unmatched_poses).points
-        agreements = tuple(place.grid.compare(points, mode.pose.mean) for mode in modes)
-        return ExaminedArea(known, candidate.prior, entry, tuple(modes), agreements)
+    def _next_area(self, comparison: OngoingComparison) -> int | None:
+        """The candidate that is next, or after those the next place where the keyframes do not lie; None at the end.
+
+        These are matched once for all hypotheses.
+        """
+        if comparison.candidates:
+            return next(iter(comparison.candidates))
+        is_in_some = any(one.entry.probability > 0.0 for one in comparison.examined)
+        is_sampled = max(comparison.query.poses) == self._newest_sampled
+        return next(iter(comparison.elsewhere), None) if is_in_some and not is_sampled else None
+
+    def _examine(self, hybrid_map: HybridMap, comparison: OngoingComparison, known: int) -> OngoingComparison:
+        """The comparison after that with one area."""
+        candidate = comparison.candidates[known]
+        place = self._grid_cache.place(hybrid_map, known, comparison.excluded)
+        entry, modes = self._entry_probability(place, candidate), None
+        examined = ExaminedArea(known, candidate.prior, entry)
+        if entry.probability > 0.0:
+            modes = self._modes(place, candidate)
+            examined = examined._replace(is_pending=modes is None)
+        if modes is not None:
+            points = self._grid_cache.grid(candidate.unmatched_poses).points
+            agreements = tuple(place.grid.compare(points, mode.pose.mean) for mode in modes)
+            examined = examined._replace(modes=tuple(modes), agreements=agreements)
+        candidates = {area: c for area, c in comparison.candidates.items() if area != known}
+        return replace(comparison, candidates=candidates, examined=(*comparison.examined, examined), prepared=None)
+
+    def _sample_negative(self, hybrid_map: HybridMap, comparison: OngoingComparison, area: int) -> OngoingComparison:
+        """The comparison after a match into an area in which the keyframes do not lie."""
+        query = self._grid_cache.grid(comparison.query.poses)
+        sample = self._negative_sample(hybrid_map, area, comparison.excluded)
+        share, work = best_share(query, sample, self._settings)
+        self.work.add(work)
+        elsewhere = tuple(other for other in comparison.elsewhere if other != area)
+        shares = (*comparison.negative_shares, share)
+        return replace(comparison, elsewhere=elsewhere, negative_shares=shares, prepared=None)
 
     def _conclude(self, hybrid_map: HybridMap, comparison: OngoingComparison) -> AreaComparison:
         """Prior and evidence of all areas that were examined."""
         examined = [one for one in comparison.examined if one.entry.probability > 0.0]
         priors = {one.area: one.entry.probability for one in examined}
         transition = transition_model(priors | dict(comparison.skipped), self._options.new_probability)
-        if priors:
-            self._sample_aliasing(hybrid_map, comparison)
+        newest = max(comparison.query.poses)
+        if priors and newest != self._newest_sampled:
+            self._newest_sampled = newest
+            self._aliasing.add_negatives(comparison.negative_shares)
         in_order = sorted(examined, key=lambda one: (-one.entry.probability, one.area))
         fits = [fit for one in in_order for fit in self._fits(hybrid_map, one, transition.known[one.area])]
         kept, dropped = _split_heaviest(fits, self._options.max_modes)
@@ -285,8 +336,8 @@ class ClosureSearch:
 
     def look_ahead(self, hybrid_map: HybridMap) -> None:
         """Build the grid of one area of the next negative sample, at an event without a search."""
-        while self._look_ahead_queue and not self._event_work:
-            area, excluded = self._look_ahead_queue.pop()
+        while self._places_ahead and not self.work.done:
+            area, excluded = self._places_ahead.pop()
             if hybrid_map.has_area(area):
                 self._negative_sample(hybrid_map, area, excluded)
                 return
@@ -318,9 +369,31 @@ class ClosureSearch:
 
         :param first: the area whose region comes first, if it was not searched yet.
         """
-        search = continue_search(search, self._global_matcher, hybrid_map, first)
-        self._event_work += search.event_work
+        return continue_search(search, self._global_matcher, hybrid_map, self.work, first)
+
+    def search_now(self, hybrid_map: HybridMap, search: GlobalSearch, area: int, clutter: Clutter) -> GlobalSearch:
+        """The search after the region of an area and the walls there, whatever work they take, and others meanwhile.
+
+        :param clutter: usual rate of contradictions of the robot's map.
+        """
+        search = search_region(search, self._global_matcher, hybrid_map, self.work, area)
+        search, is_checked = self.continue_global_search(hybrid_map, search), False
+        while not is_checked:
+            own, prior = EventWork(), self._options.aliasing_prior
+            search, is_checked = check_candidates(search, self._global_matcher, own, prior, hybrid_map, clutter)
+            self.work.add(own.done)
         return search
+
+    def check_candidates(
+        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
+    ) -> tuple[GlobalSearch, bool]:
+        """The search after the walls of its probable candidates were checked, and whether all were at this event.
+
+        :param clutter: usual rate of contradictions of the robot's map.
+        :param pose_hint: of the reference.
+        """
+        prior = self._options.aliasing_prior
+        return check_candidates(search, self._global_matcher, self.work, prior, hybrid_map, clutter, pose_hint)
 
     def is_conclusive(
         self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
@@ -342,7 +415,7 @@ class ClosureSearch:
         :param pose_hint: of the reference.
         """
         prior = self._options.aliasing_prior
-        return localize_globally(search, self._global_matcher, prior, hybrid_map, clutter, pose_hint)
+        return localize_globally(search, prior, hybrid_map, clutter, pose_hint)
 
     def end_global_localization(self) -> None:
         """Free the grids of the whole map, which take as much memory as a large building's submaps."""
@@ -350,16 +423,6 @@ class ClosureSearch:
 
     def _entry_probability(self, place: AreaPlace, candidate: AreaCandidate) -> EntryPrior:
         return entry_prior(place, candidate.prior, stack_poses(candidate.unmatched_poses), self._options.place_radius)
-
-    def _sample_aliasing(self, hybrid_map: HybridMap, comparison: OngoingComparison) -> None:
-        """Match the keyframes into areas in which they do not lie, once for all hypotheses of an event."""
-        poses = comparison.query.poses
-        newest = max(poses)
-        if newest != self._newest_sampled:
-            self._newest_sampled = newest
-            elsewhere = [area for area in comparison.elsewhere if hybrid_map.has_area(area)]
-            places = [self._negative_sample(hybrid_map, area, comparison.excluded) for area in elsewhere]
-            self._aliasing.add_negatives(best_shares(self._grid_cache.grid(poses), places, self._settings))
 
     def _negative_sample(self, hybrid_map: HybridMap, area: int, excluded: Collection[int]) -> NegativeSample:
         """An area's grid, and the pose of its middle keyframe."""
@@ -379,7 +442,7 @@ class ClosureSearch:
             settings = replace(settings, min_log_ratio=MIN_LOG_RATIO)
         match = match_areas(query, place.grid, candidate.prior, settings, bounds)
         modes = match.modes
-        self._event_work += match.work
+        self.work.add(match.work)
         poses = stack_poses(candidate.unmatched_poses)
         areas = [containing_area(place, se2.compose(mode.pose.mean, poses), radius) for mode in modes]
         if modes and areas[max(range(len(modes)), key=lambda n: modes[n].log_mass)] is None:

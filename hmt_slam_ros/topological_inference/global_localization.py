@@ -29,6 +29,7 @@ from hmt_slam_ros.registration.consistency import (
     WALLS_OUTLIER_RATE,
     Clutter,
 )
+from hmt_slam_ros.topological_inference.event_work import EventWork
 from hmt_slam_ros.topological_inference.global_scan_matching import GlobalScanMatcher, PoseCandidate
 from hmt_slam_ros.topological_inference.place_recognition import PerceptualAliasing
 
@@ -45,9 +46,6 @@ _MIN_WALL_CHECK_PROBABILITY = 0.05
 
 _OLD_MAP_FACTOR = 2.0
 """Ratio of the outlier rates of walls in an old map and in a recent one: people stood elsewhere."""
-
-_EVENT_WORK = 8_000_000
-"""Work of a search after which an event begins no further region: samples looked up, about 20 ms."""
 
 _HINT_DEVIATIONS = 4.0
 """Deviations of a pose hint beyond which no area is searched."""
@@ -129,8 +127,9 @@ class GlobalSearch:
     :ivar unexamined: {area: probability by its appearance} of those that were not searched yet.
     :ivar candidates: what was found.
     :ivar fitting_areas: the areas of the candidates' regions, and those around: a robot drives on.
-    :ivar event_work: work of the last event.
     :ivar refuted: number of the candidates that were tested in vain.
+    :ivar prepared: the area whose region's map was made at an earlier step, and which is matched next; else None.
+    :ivar is_map_missing: whether something fits there, so that the whole map of the region is made before.
     """
 
     poses: Mapping[int, Pose]
@@ -139,13 +138,9 @@ class GlobalSearch:
     unexamined: Mapping[int, float]
     candidates: tuple[PoseCandidate, ...] = ()
     fitting_areas: frozenset[int] = frozenset()
-    event_work: int = 0
     refuted: int = 0
-
-    @property
-    def is_exhausted(self) -> bool:
-        """Whether the work of the last event was done, so that candidates are tested at the next one."""
-        return self.event_work >= _EVENT_WORK
+    prepared: int | None = None
+    is_map_missing: bool = False
 
     @property
     def best_share(self) -> float:
@@ -178,35 +173,101 @@ def begin_search(
 
 
 def continue_search(
-    search: GlobalSearch, matcher: GlobalScanMatcher, hybrid_map: HybridMap, first: int | None = None
+    search: GlobalSearch,
+    matcher: GlobalScanMatcher,
+    hybrid_map: HybridMap,
+    work: EventWork,
+    first: int | None = None,
 ) -> GlobalSearch:
     """The search after the regions of one event, the most probable by their appearance.
 
-    It ends with the region that exceeds the work of an event. Areas that the map lacks by now are dropped.
+    The map of a region and the match with it are two steps. Areas that the map lacks by now are dropped.
 
+    :param work: of the event, to which that of the search is added.
     :param first: the area whose region comes first, if it was not searched yet.
     """
+    search = _without_missing_areas(search, hybrid_map)
+    while search.unexamined and not work.is_exhausted:
+        search = _step(search, matcher, hybrid_map, work, first)
+    return search
+
+
+def search_region(
+    search: GlobalSearch, matcher: GlobalScanMatcher, hybrid_map: HybridMap, work: EventWork, area: int
+) -> GlobalSearch:
+    """The search after the region of an area, or of the most probable one if the area is not to be searched.
+
+    :param work: of the event, to which that of the search is added.
+    """
+    search = _without_missing_areas(search, hybrid_map)
+    left = search.unexamined
+    while search.unexamined and search.unexamined == left:
+        search = _step(search, matcher, hybrid_map, work, area)
+    return search
+
+
+def _without_missing_areas(search: GlobalSearch, hybrid_map: HybridMap) -> GlobalSearch:
     candidates = tuple(candidate for candidate in search.candidates if hybrid_map.has_area(candidate.area))
     unexamined = {area: p for area, p in search.unexamined.items() if hybrid_map.has_area(area)}
-    search, work = replace(search, candidates=candidates, unexamined=unexamined), 0
-    while search.unexamined and work < _EVENT_WORK:
-        probabilities = dict(search.unexamined)
-        if first is not None and first in probabilities:
-            probabilities[first] = 1.0
-        match = matcher.match_region(hybrid_map, search.poses, search.before, probabilities, search.best_share)
-        search = replace(
-            search,
-            unexamined={area: p for area, p in search.unexamined.items() if area not in match.areas},
-            candidates=search.candidates + match.candidates,
-            fitting_areas=search.fitting_areas | (match.around if match.candidates else frozenset()),
-        )
-        work += match.work
-    return replace(search, event_work=work)
+    return replace(search, candidates=candidates, unexamined=unexamined)
+
+
+def _step(
+    search: GlobalSearch, matcher: GlobalScanMatcher, hybrid_map: HybridMap, work: EventWork, first: int | None
+) -> GlobalSearch:
+    """The search after the next map was made, or the next region was matched."""
+    probabilities = dict(search.unexamined)
+    if first is not None and first in probabilities:
+        probabilities[first] = 1.0
+    region = matcher.find_region(hybrid_map, search.before, probabilities)
+    if search.prepared != region.reference or search.is_map_missing:
+        whole = search.is_map_missing and search.prepared == region.reference
+        matcher.prepare_region(hybrid_map, region, search.before, whole=whole)
+        search = replace(search, prepared=region.reference, is_map_missing=False)
+        if work.is_exhausted:
+            return search
+    match = matcher.match_region(hybrid_map, region, search.poses, search.before, search.best_share)
+    work.add(match.work)
+    if match.candidates is None:
+        return replace(search, is_map_missing=True)
+    return replace(
+        search,
+        unexamined={area: p for area, p in search.unexamined.items() if area not in region.own_areas},
+        candidates=search.candidates + match.candidates,
+        fitting_areas=search.fitting_areas | (region.poses.keys() if match.candidates else frozenset()),
+        prepared=None,
+    )
+
+
+def check_candidates(
+    search: GlobalSearch,
+    matcher: GlobalScanMatcher,
+    work: EventWork,
+    aliasing_prior: float,
+    hybrid_map: HybridMap,
+    clutter: Clutter,
+    pose_hint: PoseHint | None = None,
+) -> tuple[GlobalSearch, bool]:
+    """The search after the walls of its probable candidates were checked, and whether all were at this event.
+
+    :param work: of the event, to which that of the checks is added. The other arguments are those of
+        :func:`localize_globally`.
+    """
+    search = _without_missing_areas(search, hybrid_map)
+    candidates = list(search.candidates)
+    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint)
+    likely = np.flatnonzero(_probabilities(log_weights, log_rest) >= _MIN_WALL_CHECK_PROBABILITY)
+    left = [n for n in likely.tolist() if candidates[n].walls is None]
+    while left and not work.is_exhausted:
+        n = left.pop(0)
+        walls, own = matcher.check_walls(hybrid_map, candidates[n], search.poses, search.before)
+        candidates[n] = candidates[n]._replace(walls=walls)
+        work.add(own)
+    return replace(search, candidates=tuple(candidates)), not left
 
 
 def localize_globally(
     search: GlobalSearch,
-    matcher: GlobalScanMatcher,
     aliasing_prior: float,
     hybrid_map: HybridMap,
     clutter: Clutter,
@@ -214,20 +275,19 @@ def localize_globally(
 ) -> PoseDistribution:
     """The distribution of the pose of some keyframes in the whole map, as far as it was searched.
 
-    For probable candidates, walls that beams pass count against them. What was not searched belongs to the rest.
+    Walls that beams pass count against the candidates that were checked. What was not searched belongs to the rest.
 
     :param aliasing_prior: prior probability that keyframes match an area in which they do not lie.
     :param clutter: usual rate of contradictions of the robot's map, where that is above the rate of maps.
     :param pose_hint: of the reference.
     """
-    candidates = search.candidates
     log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint)
     wall_rate = max(WALLS_OUTLIER_RATE, _OLD_MAP_FACTOR * clutter.wall_outlier_rate)
-    for n in np.flatnonzero(_probabilities(log_weights, log_rest) >= _MIN_WALL_CHECK_PROBABILITY):
-        walls = matcher.check_walls(hybrid_map, candidates[n], search.poses, search.before)
-        # Walls without violations add nothing to the surfaces, so they only count against a candidate.
-        log_weights[n] += min(0.0, WALLS_OF_MAP.log_likelihood_ratio(walls, wall_rate))
-    return PoseDistribution(candidates, _probabilities(log_weights, log_rest))
+    for n, candidate in enumerate(search.candidates):
+        if candidate.walls is not None:
+            # Walls without violations add nothing to the surfaces, so they only count against a candidate.
+            log_weights[n] += min(0.0, WALLS_OF_MAP.log_likelihood_ratio(candidate.walls, wall_rate))
+    return PoseDistribution(search.candidates, _probabilities(log_weights, log_rest))
 
 
 def is_conclusive(

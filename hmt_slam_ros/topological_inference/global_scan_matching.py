@@ -79,8 +79,11 @@ those in free space count against a match: so also matches are dropped whose sha
 _MAX_MATCHES = 40
 """Most matches per region."""
 
-CELL_WORK = 20
-"""Work of a cell of a region's map, which may have to be built: in the time of so many samples."""
+_REGION_WORK = 2_000_000
+"""Work to find the areas and the keyframes of a region."""
+
+_BEAM_WORK = 2500
+"""Work of a beam that is tested on walls: it is drawn in a map, and followed through another one."""
 
 
 class PoseCandidate(NamedTuple):
@@ -89,11 +92,13 @@ class PoseCandidate(NamedTuple):
     :ivar area: in whose place they lie.
     :ivar mode: their pose there.
     :ivar agreement: of their surfaces with the map of the place.
+    :ivar walls: on which beams of either side end, and which they pass; None before they were checked.
     """
 
     area: int
     mode: MatchMode
     agreement: Agreement
+    walls: Agreement | None = None
 
 
 def is_certain(candidate: PoseCandidate) -> bool:
@@ -124,14 +129,14 @@ class FreeSpaceCheck:
     def __init__(self, scans: Mapping[int, Scan], configuration: Configuration) -> None:
         self._scans, self._configuration = scans, configuration
 
-    def compare(self, known: Mapping[int, Pose], query: Mapping[int, Pose]) -> Agreement:
-        """Samples of the walls of either on which beams of the other end (on), and which they pass (free).
+    def compare(self, known: Mapping[int, Pose], query: Mapping[int, Pose]) -> tuple[Agreement, int]:
+        """Samples of the walls of either that beams of the other hit (on) or pass (free), and the work.
 
         :param known: {keyframe: ``map_T_base`` (3,)}, of which those near the others count.
         :param query: the others, likewise.
         """
         if not known or not query:
-            return Agreement(0, 0, 0)
+            return Agreement(0, 0, 0), 0
         centroid = np.append(stack_poses(query)[:, :2].mean(axis=0), 0.0)
         query_poses = stack_poses(query) - centroid
         known_poses = stack_poses(known) - centroid
@@ -144,7 +149,8 @@ class FreeSpaceCheck:
         counts = _count_in_map(mapping, known_scans, known_poses, query_scans, query_poses)
         counts = counts + _count_in_map(mapping, query_scans, query_poses, known_scans, known_poses)
         hits, violations = counts.tolist()
-        return Agreement(hits + violations, hits, violations)
+        beams = sum(len(scan.points) for scan in [*known_scans, *query_scans])
+        return Agreement(hits + violations, hits, violations), _BEAM_WORK * beams
 
 
 def _count_in_map(
@@ -169,10 +175,12 @@ def _count_in_map(
 class Region(NamedTuple):
     """Areas that are searched together.
 
+    :ivar reference: the area in whose frame they are.
     :ivar poses: {area: ``reference_T_area``} of all that the region's map holds.
     :ivar own_areas: the areas that are searched here; the others belong to other regions.
     """
 
+    reference: int
     poses: dict[int, Pose]
     own_areas: frozenset[int]
 
@@ -180,15 +188,11 @@ class Region(NamedTuple):
 class RegionMatch(NamedTuple):
     """The matches of keyframes into a region.
 
-    :ivar areas: that were searched.
-    :ivar around: all that the region's map holds.
-    :ivar candidates: each in the frame of its area.
-    :ivar work: of search and map, the number of samples looked up.
+    :ivar candidates: each in the frame of its area; None where something fits, but the whole map is not held.
+    :ivar work: the number of samples looked up.
     """
 
-    areas: frozenset[int]
-    around: frozenset[int]
-    candidates: tuple[PoseCandidate, ...]
+    candidates: tuple[PoseCandidate, ...] | None
     work: int
 
 
@@ -210,36 +214,51 @@ class GlobalScanMatcher:
         self._grid_cache, self._free_space_check = grid_cache, free_space_check
         self._settings, self._radius, self._reach = settings, radius, reach
 
+    def find_region(self, hybrid_map: HybridMap, before: float, unexamined: Mapping[int, float]) -> Region:
+        """The region of the most probable area.
+
+        :param before: the map is that of the keyframes before this one.
+        :param unexamined: {area: probability} of the areas that were not searched yet, at least one.
+        """
+        older = [area for area in hybrid_map.area_ids() if min(hybrid_map.keyframes(area), default=before) < before]
+        reference = min(unexamined, key=lambda area: (-unexamined[area], area))
+        return region_around(hybrid_map, reference, older, unexamined.keys(), self._reach)
+
+    def prepare_region(self, hybrid_map: HybridMap, region: Region, before: float, *, whole: bool = False) -> None:
+        """Make the map for :meth:`match_region`, unless it is held.
+
+        :param whole: for a region in which something fits; else its coarse log-ratios are enough.
+        """
+        known, _ = keyframes_before(hybrid_map, region.poses, before)
+        if whole:
+            self._grid_cache.grid(known)
+        else:
+            self._grid_cache.coarse_grid(known)
+
     def match_region(
-        self,
-        hybrid_map: HybridMap,
-        poses: Mapping[int, Pose],
-        before: float,
-        unexamined: Mapping[int, float],
-        best_share: float,
+        self, hybrid_map: HybridMap, region: Region, poses: Mapping[int, Pose], before: float, best_share: float
     ) -> RegionMatch:
-        """The best match of the keyframes into the region of the most probable area, and those that matter beside it.
+        """The best match of the keyframes into a region, and those that matter beside it.
 
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
-        :param unexamined: {area: probability} of the areas that were not searched yet, at least one.
-        :param best_share: largest matched share in those that were.
+        :param best_share: largest matched share in the regions that were searched.
         """
         query = replace(self._grid_cache.grid(poses), points=self._grid_cache.static_points(poses))
-        older = [area for area in hybrid_map.area_ids() if min(hybrid_map.keyframes(area), default=before) < before]
-        reference = min(unexamined, key=lambda area: (-unexamined[area], area))
-        region = region_around(hybrid_map, reference, older, unexamined.keys(), self._reach)
         min_log_ratio = max(_MIN_LOG_RATIO, (best_share - _SHARE_MARGIN) * _SURFACE_LOG_RATIO)
         known, areas = keyframes_before(hybrid_map, region.poses, before)
         keyframe_areas = np.array(areas, dtype=np.int64)
         candidates, work = self._match_keyframes(known, keyframe_areas, query, poses, region.own_areas, min_log_ratio)
+        work += _REGION_WORK
+        if candidates is None:
+            return RegionMatch(None, work)
         in_frames = [c._replace(mode=_mode_in_frame(c.mode, region.poses[c.area])) for c in candidates]
-        return RegionMatch(region.own_areas, frozenset(region.poses), tuple(in_frames), work)
+        return RegionMatch(tuple(in_frames), work)
 
     def check_walls(
         self, hybrid_map: HybridMap, candidate: PoseCandidate, poses: Mapping[int, Pose], before: float
-    ) -> Agreement:
-        """Walls on which beams end, and which they pass, between the map and keyframes at a candidate.
+    ) -> tuple[Agreement, int]:
+        """Walls on which beams end, and which they pass, between the map and keyframes at a candidate; and the work.
 
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
@@ -262,10 +281,10 @@ class GlobalScanMatcher:
         poses: Mapping[int, Pose],
         areas: Collection[int],
         min_log_ratio: float,
-    ) -> tuple[list[PoseCandidate], int]:
+    ) -> tuple[list[PoseCandidate] | None, int]:
         """Matches of the keyframes into a region, in its frame, and the work.
 
-        The whole map of the region is built where something fits only.
+        The whole map of the region is needed where something fits only: None where it is not held.
 
         :param known: {keyframe: ``region_T_base``} of the map.
         :param keyframe_areas: shape (len(known),), the area of each.
@@ -289,16 +308,17 @@ class GlobalScanMatcher:
         constraint = constrain_around(positions, is_searched, stack_poses(poses)[:, :2], self._radius, surface.cell)
         bounds = query_bounds(positions[is_searched], query, poses, self._radius)
         cells = find_cells(sparse, surface, _NO_POINTS, _FLAT, settings, bounds, constraint)
-        work = cells.work + CELL_WORK * surface.log_ratio.size
         if not cells.score.size:
-            return [], work
+            return [], cells.work
+        if not self._grid_cache.holds_grid(known):
+            return None, cells.work
         place = AreaPlace(NO_AREA, keyframe_areas, positions, self._grid_cache.grid(known))
         candidates = []
         for mode in match_areas(sparse, place.grid, _FLAT, settings, bounds, cells).modes:
             area = containing_area(place, se2.compose(mode.pose.mean, stack_poses(poses)), self._radius)
             if area is not None and area in areas:
                 candidates.append(PoseCandidate(area, mode, place.grid.compare(query.points, mode.pose.mean)))
-        return candidates, work
+        return candidates, cells.work
 
 
 def region_around(
@@ -318,7 +338,7 @@ def region_around(
         for other in poses.keys() & set(unexamined)
         if min_distance(positions, keyframe_positions(hybrid_map, other, poses[other])) <= reach
     }
-    return Region(poses, frozenset(own_areas))
+    return Region(reference, poses, frozenset(own_areas))
 
 
 def _region_neighborhood(reach: float) -> Neighborhood:

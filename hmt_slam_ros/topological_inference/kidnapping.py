@@ -75,7 +75,7 @@ def _confirms_tracked_pose(branching: Branching, parent: Parent, since: int) -> 
     first = min(tracked)
     poses = {keyframe: se2.between(tracked[first], pose) for keyframe, pose in tracked.items()}
     search = branching.search.begin_global_search(parent.hybrid_map, poses, first)
-    search = branching.search.continue_global_search(parent.hybrid_map, search, parent.area)
+    search = branching.search.search_now(parent.hybrid_map, search, parent.area, parent.clutter)
     distribution = branching.localize_globally(parent, search)
     tracked_pose = PoseInArea(parent.area, first, tracked[first])
     return prefers_tracked_pose(parent.hybrid_map, distribution, tracked_pose, poses, branching.options)
@@ -92,7 +92,7 @@ def _kidnapped_child(branching: Branching, parent: Parent, keyframes: Sequence[i
     """The child that was kidnapped before the first of some keyframes of its area, which begin a new area."""
     query = branching.query(parent, keyframes)
     search = branching.search.begin_global_search(parent.hybrid_map, query.poses, keyframes[0])
-    search = branching.search.continue_global_search(parent.hybrid_map, search, parent.area)
+    search = branching.search.search_now(parent.hybrid_map, search, parent.area, parent.clutter)
     distribution = branching.localize_globally(parent, search).with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
     tracked_pose = PoseInArea(parent.area, keyframes[0], query.belief.mean)
     evidence = log_bayes_factor(parent.hybrid_map, distribution, tracked_pose, query.poses)

@@ -162,21 +162,19 @@ class NegativeSample(NamedTuple):
     pose: Float64
 
 
-def best_shares(query: AreaGrid, negatives: Iterable[NegativeSample], settings: MatchSettings) -> list[float]:
-    """The matched share of the keyframes' surfaces at their best match in each of the places.
+def best_share(query: AreaGrid, place: NegativeSample, settings: MatchSettings) -> tuple[float, int]:
+    """The matched share of the keyframes' surfaces at their best match in a place, and the number of samples looked up.
 
     :param query: grid of the keyframes, in the frame of the first of them.
     """
     settings = replace(settings, gate=_GATE, margin=_MARGIN, min_log_ratio=MIN_LOG_RATIO)
-    shares = []
-    for place in negatives:
-        matches = [
-            best_pose(query, place.grid, PoseGaussian(place.pose + heading, _TRAVEL_COVARIANCE), settings)
-            for heading in _HEADINGS
-        ]
-        best = max((match for match in matches if match is not None), key=lambda match: match[1], default=None)
-        shares.append(0.0 if best is None else place.grid.compare(query.points, best[0]).matched_share)
-    return shares
+    found = [
+        best_pose(query, place.grid, PoseGaussian(place.pose + heading, _TRAVEL_COVARIANCE), settings)
+        for heading in _HEADINGS
+    ]
+    best = max((match for match, _ in found if match is not None), key=lambda match: match[1], default=None)
+    share = 0.0 if best is None else place.grid.compare(query.points, best[0]).matched_share
+    return share, sum(work for _, work in found)
 
 
 @dataclass

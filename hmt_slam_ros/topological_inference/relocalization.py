@@ -163,28 +163,30 @@ def is_searching(parent: Parent) -> bool:
 def update_relocalization(branching: Branching, parent: Parent) -> Branches:
     """The children of a lost hypothesis after the search of an event: still lost, or relocalized.
 
-    Where the search takes the work of the event, the candidates are tested at the next one. It waits where another
-    hypothesis took the work.
+    Candidates whose walls the work of the event does not suffice for are checked at the next one. The search waits
+    where another hypothesis took the work.
 
     :param parent: a lost hypothesis.
     """
     lost = parent.state.localization
     assert isinstance(lost, Lost)
-    if branching.search.is_exhausted:
+    if branching.search.work.is_exhausted:
         return Branches([parent.unchanged_child()])
-    search = lost.search
-    if search is None or not (search.is_exhausted and _is_conclusive(branching, parent, lost, search)):
+    search = lost.search or _begin_search(branching, parent, lost)
+    if lost.search is None or not _is_conclusive(branching, parent, lost, search):
         first = None if lost.candidate is None else lost.candidate.area
-        search = search or _begin_search(branching, parent, lost)
         search = branching.search.continue_global_search(parent.hybrid_map, search, first)
-        is_postponed = search.is_exhausted and bool(search.candidates)
-        if is_postponed or not _is_conclusive(branching, parent, lost, search):
-            return Branches([_child_with_localization(parent, replace(lost, search=search))])
+    is_over = _is_conclusive(branching, parent, lost, search)
+    hint = _hint_of_first(lost, search.poses)
+    if is_over:
+        search, is_over = branching.search.check_candidates(parent.hybrid_map, search, parent.clutter, hint)
+    if not is_over:
+        return Branches([_child_with_localization(parent, replace(lost, search=search))])
     after = replace(lost, search=None, searched=max(search.poses))
-    branches = _conclude_search(branching, parent, after, search, _hint_of_first(lost, search.poses))
+    branches = _conclude_search(branching, parent, after, search, hint)
     # Walls and the odds of a kidnapping may count against a candidate: the rest is searched first then.
     if search.unexamined and all(_is_without_candidate(child) for child in branches.children):
-        search = replace(search, event_work=0, refuted=len(search.candidates))
+        search = replace(search, refuted=len(search.candidates))
         return Branches([_child_with_localization(parent, replace(lost, search=search))])
     return branches
 
