@@ -129,6 +129,29 @@ def test_agreement_counts_samples_on_surfaces_and_amid_free_space():
     assert min(expected) > 5
 
 
+def points_near(points, x, y, reach=0.3):
+    return np.count_nonzero(np.hypot(*(points - [x, y]).T) < reach)
+
+
+def test_the_points_of_a_person_who_walked_on_are_no_surface_of_the_map_and_those_of_a_post_are():
+    post, poses = box(4.5, 1.0, 4.7, 1.2), np.array([[1.0 + 0.2 * k, 2.0, 0.0] for k in range(6)])
+    people = [box(2.0 + 0.5 * k, 2.2, 2.3 + 0.5 * k, 2.5) for k in range(6)]
+    worlds = [np.concatenate((ROOM, post, person)) for person in people]
+    scans = [
+        scan_in(world, pose, field_of_view=2 * np.pi, beams=721) for world, pose in zip(worlds, poses, strict=True)
+    ]
+    one_by_one = [build_area_grid([scan], pose[None], MODEL).points for scan, pose in zip(scans, poses, strict=True)]
+    points = build_area_grid(scans, poses, MODEL).points
+    # The last two stand where no later scan looked through them.
+    for k in range(4):
+        x, y = 2.15 + 0.5 * k, 2.35
+        assert points_near(one_by_one[k], x, y) > 1
+        assert points_near(points, x, y) == 0
+    assert points_near(points, 4.6, 1.1) > 1
+    walls = build_area_grid([scan_in(ROOM, pose, field_of_view=2 * np.pi, beams=721) for pose in poses], poses, MODEL)
+    assert len(points) > 0.9 * len(walls.points)
+
+
 def plain_log_ratios(scans, poses, model, grid):
     """The log-ratio in the middle of each half cell, from the distances to all end points and the cells on beams."""
     half, (rows, columns) = 0.5 * model.cell, grid.fine_log_ratio.shape

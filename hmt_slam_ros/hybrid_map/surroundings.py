@@ -24,7 +24,6 @@ from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.polar_scan import FREE, classify_points, to_polar_scan
 
 Pose = Float64
 Grid = TypeVar("Grid")
@@ -349,15 +348,6 @@ class GridCache:
             lambda poses: _coarse_part(self.grid(poses)),
             lambda poses: _coarse_part(self._rebuild(poses)[0]),
         )
-
-    def static_points(self, keyframes: Mapping[int, Pose]) -> Float64:
-        """Surface points of the keyframes that none of them sees through, shape (n, 2), m."""
-        points = self.grid(keyframes).points
-        is_passed = np.zeros(len(points), dtype=np.bool_)
-        for keyframe, pose in keyframes.items():
-            polar_scan = to_polar_scan(self._scans[keyframe])
-            is_passed |= classify_points(polar_scan, se2.transform(se2.inverse(pose), points)) == FREE
-        return points[~is_passed]
 
     def grid_before(self, hybrid_map: HybridMap, poses: Mapping[int, Pose], keyframe: int) -> AreaGrid:
         """What the keyframes before a given one saw, of areas at ``poses``, {area: pose}."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Bool, Float32, Float64, Int64
+from hmt_slam_ros.arrays import Bool, Float32, Float64, Int32, Int64
 from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
@@ -71,7 +72,8 @@ class AreaGrid:
     :ivar fine_log_ratio: shape (2 rows, 2 columns), float32, the same at the centers of cells half as long; smooth
         enough for interpolation, and ``log_ratio`` is the mean of four.
     :ivar free: shape (rows, columns), whether a beam passed through the cell.
-    :ivar points: shape (n, 2), one surface point per voxel, m, area frame: nearly independent samples.
+    :ivar points: shape (n, 2), one point per voxel of the surfaces that stayed, m, area frame: nearly independent
+        samples. Beside a robot that people follow, most end points are on people.
     """
 
     origin: Float64
@@ -114,12 +116,12 @@ def build_area_grid(scans: Sequence[Scan], poses: Float64, model: GridModel) -> 
     # The corner is a multiple of the cell, so that cells of all grids of an area coincide.
     origin = np.floor((smallest - reach) / model.cell) * model.cell
     columns, rows = np.ceil((largest + reach - origin) / model.cell).astype(np.int64) + 1
-    free = np.zeros((rows, columns), dtype=np.bool_)
-    _mark_free(free, origin, model.cell, lasers, hits)
+    counts = _count_scans((rows, columns), origin, model.cell, lasers, hits, numbers)
     fine = np.full((2 * rows, 2 * columns), np.inf, dtype=np.float32)
     _lower_distances(fine, origin, 0.5 * model.cell, _fill_gaps(hits, numbers, 0.5 * model.cell), reach)
-    _convert_to_log_ratio(fine, free, model.sigma, model.surface_ratio, model.free_ratio)
-    return AreaGrid(origin, model.cell, _downsample(fine), fine, free, thin_points(hits, model.spacing))
+    _convert_to_log_ratio(fine, counts.free, model.sigma, model.surface_ratio, model.free_ratio)
+    static = hits[_mark_static(hits, counts, origin, model.cell)]
+    return AreaGrid(origin, model.cell, _downsample(fine), fine, counts.free, thin_points(static, model.spacing))
 
 
 def surface_points(scan: Scan, model: GridModel) -> Float64:
@@ -220,16 +222,63 @@ def _downsample(fine: Float32) -> Float32:
     return coarse
 
 
+class _ScanCounts(NamedTuple):
+    """What the scans show of each cell; shapes (rows, columns).
+
+    :ivar free: whether a beam passed, up to one cell before its end point.
+    :ivar passed: how many scans passed, but did not end there.
+    :ivar ended: how many scans ended there.
+    """
+
+    free: Bool
+    passed: Int32
+    ended: Int32
+
+
 @njit(cache=True)
-def _mark_free(free: Bool, origin: Float64, cell: float, lasers: Float64, points: Float64) -> None:
-    """Mark the cells from the laser to one cell before each end point."""
+def _count_scans(
+    shape: tuple[int, int], origin: Float64, cell: float, lasers: Float64, points: Float64, scans: Int64
+) -> _ScanCounts:
+    """The counts of beams from ``lasers`` to ``points``, each (n, 2), of the scans with the ascending numbers (n,)."""
+    free, passed, ended = np.zeros(shape, np.bool_), np.zeros(shape, np.int32), np.zeros(shape, np.int32)
+    last = np.full(shape, -1, np.int32)
+    begin = 0
+    while begin < points.shape[0]:
+        end, scan = begin, np.int32(scans[begin])
+        while end < points.shape[0] and scans[end] == scan:
+            row, column = int((points[end, 1] - origin[1]) / cell), int((points[end, 0] - origin[0]) / cell)
+            ended[row, column] += last[row, column] != scan
+            last[row, column] = scan
+            end += 1
+        for k in range(begin, end):
+            x0, y0 = (lasers[k, 0] - origin[0]) / cell, (lasers[k, 1] - origin[1]) / cell
+            dx = (points[k, 0] - origin[0]) / cell - x0
+            dy = (points[k, 1] - origin[1]) / cell - y0
+            steps = int(np.ceil(max(abs(dx), abs(dy))))
+            for s in range(steps - 1):
+                row, column = int(y0 + dy * s / steps), int(x0 + dx * s / steps)
+                free[row, column] = True
+                passed[row, column] += last[row, column] != scan
+                last[row, column] = scan
+        begin = end
+    return _ScanCounts(free, passed, ended)
+
+
+@njit(cache=True)
+def _mark_static(points: Float64, counts: _ScanCounts, origin: Float64, cell: float) -> Bool:
+    """Mark the end points (n, 2) on objects that stayed, shape (n,).
+
+    One that moved was passed by as many scans as ended on it, in its cell and in those around. Walls are passed on one
+    side alone, and posts seldom.
+    """
+    passed, ended = counts.passed, counts.ended
+    stayed = np.zeros(points.shape[0], np.bool_)
     for k in range(points.shape[0]):
-        x0, y0 = (lasers[k, 0] - origin[0]) / cell, (lasers[k, 1] - origin[1]) / cell
-        dx = (points[k, 0] - origin[0]) / cell - x0
-        dy = (points[k, 1] - origin[1]) / cell - y0
-        steps = int(np.ceil(max(abs(dx), abs(dy))))
-        for s in range(steps - 1):
-            free[int(y0 + dy * s / steps), int(x0 + dx * s / steps)] = True
+        row, column = int((points[k, 1] - origin[1]) / cell), int((points[k, 0] - origin[0]) / cell)
+        for r in range(max(0, row - 1), min(passed.shape[0], row + 2)):
+            for c in range(max(0, column - 1), min(passed.shape[1], column + 2)):
+                stayed[k] |= passed[r, c] == 0 or passed[r, c] < ended[r, c]
+    return stayed
 
 
 @njit(cache=True)

@@ -244,7 +244,7 @@ class GlobalScanMatcher:
         :param before: the map is that of the keyframes before this one.
         :param best_share: largest matched share in the regions that were searched.
         """
-        query = replace(self._grid_cache.grid(poses), points=self._grid_cache.static_points(poses))
+        query = self._grid_cache.grid(poses)
         min_log_ratio = max(_MIN_LOG_RATIO, (best_share - _SHARE_MARGIN) * _SURFACE_LOG_RATIO)
         known, areas = keyframes_before(hybrid_map, region.poses, before)
         keyframe_areas = np.array(areas, dtype=np.int64)
