@@ -343,3 +343,16 @@ def test_a_recheck_suspects_the_arcs_of_a_promised_place_too():
     parent = replace(parent, state=replace(parent.state, unmatched_keyframes=tuple(newest[1:])))
     arcs = [arc for child in branching.recheck(parent).children for arc in child.arcs]
     assert [is_uninformative(arc.pose) for arc in arcs] == [True]
+
+
+def test_the_next_keyframes_that_do_not_fit_in_the_same_promised_place_are_no_further_evidence():
+    parent, branching, newest = rooms_apart((OTHER, OTHER, ROOM), ((0.2, 0.1), (2.0, 0.0)), 0.1)
+    known_through_another(parent.hybrid_map)
+    parent = replace(parent, state=replace(parent.state, unmatched_keyframes=tuple(newest[1:3])))
+    stay, *suspected = branching.recheck(parent).children
+    assert math.exp(stay.log_weight) == pytest.approx(0.05)
+    assert [is_uninformative(arc.pose) for child in suspected for arc in child.arcs] == [True]
+    again = replace(parent, state=replace(stay.state, unmatched_keyframes=tuple(newest[3:])))
+    (only,) = branching.recheck(again).children
+    assert math.exp(only.log_weight) == pytest.approx(1.0)
+    assert list(only.arcs) == []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -44,6 +44,20 @@ class AreaComparison(NamedTuple):
     examined_areas: tuple[int, ...]
     pending_candidates: tuple[int, ...]
     skipped_weight: float
+
+    def promised_probability(self, compared: Collection[int]) -> float:
+        """Probability by the arcs of the examined areas but those of ``compared``."""
+        return sum(self.transition.known[area] for area in self.examined_areas if area not in compared)
+
+    def new_probability(self, compared: Collection[int]) -> float:
+        """Probability that the keyframes lie in new ground, or in an area where earlier ones did not fit either.
+
+        What keeps them from fitting, people or a changed room, lasts: that nothing fits again tells nothing more.
+
+        :param compared: areas with which earlier keyframes were compared.
+        """
+        again = [area for area in self.examined_areas if area in compared and not self.fits]
+        return self.transition.new + sum(self.transition.known[area] for area in again)
 
 
 class ExaminedArea(NamedTuple):

@@ -229,11 +229,12 @@ class Branching:
 
     def _branch_at_cut(self, parent: Parent, query: Query, found: AreaComparison) -> Branches:
         """The children of a cut after the comparison."""
+        compared = parent.state.matched_keyframes
         state = parent.state.after_matching(found.examined_areas, list(query.poses), found.pending_candidates)
         parent = replace(parent, state=state)
-        children = [self._enter_new(parent, query, math.log(found.transition.new))]
+        children = [self._enter_new(parent, query, math.log(found.new_probability(compared)))]
         children += [self._enter_known(parent, query, fit) for fit in found.fits]
-        children += self._suspect_arcs(parent, query, found)
+        children += self._suspect_arcs(parent, query, found, compared)
         return Branches(children, True, _log(found.skipped_weight) + parent.log_weight)
 
     def recheck(self, parent: Parent, only: Collection[int] = ()) -> Branches:
@@ -260,6 +261,7 @@ class Branching:
         if isinstance(found, OngoingComparison):
             return Branches([self._wait(parent, found)])
         is_retry, keyframes = comparison.kind == "retry", list(comparison.query.poses)
+        compared = parent.state.matched_keyframes
         state = parent.state.after_matching(
             found.examined_areas, keyframes, found.pending_candidates, all_areas=not is_retry
         )
@@ -268,10 +270,10 @@ class Branching:
         joined = self._joined_areas(parent)
         fits = [fit for fit in found.fits if fit.area not in joined]
         # The probability that they are in no place counted when they fitted beside it.
-        log_new = 0.0 if is_retry and not fits else math.log(found.transition.new)
+        log_new = 0.0 if is_retry and not fits else math.log(found.new_probability(compared))
         stay = replace(parent.unchanged_child(), log_weight=parent.log_weight + log_new)
         children = [stay, *(self._join(parent, comparison.query, fit) for fit in fits)]
-        children += self._suspect_arcs(parent, comparison.query, found)
+        children += self._suspect_arcs(parent, comparison.query, found, compared)
         return Branches(children, True, _log(found.skipped_weight) + parent.log_weight)
 
     @staticmethod
@@ -382,15 +384,23 @@ class Branching:
         is_lost = not child.state.is_lost and is_wide(query.belief.covariance, self._filter)
         return _lose(child, parent, query) if is_lost else child
 
-    def _suspect_arcs(self, parent: Parent, query: Query, found: AreaComparison) -> list[Child]:
+    def _suspect_arcs(
+        self, parent: Parent, query: Query, found: AreaComparison, compared: Collection[int]
+    ) -> list[Child]:
         """The child in which the arcs are wrong, where they promise a known place and nothing fits there; or none.
 
         The ground of that place was mapped twice then, and the two do not agree. The robot may be anywhere.
+
+        :param compared: areas with which earlier keyframes were compared.
         """
-        promised = sum(found.transition.known[area] for area in found.examined_areas)
         own = sorted(parent.hybrid_map.keyframes(parent.area))
         keyframes = [k for k in own if k >= min(query.poses)]
-        if found.fits or promised < _PROMISED_PROBABILITY or parent.state.is_lost or keyframes == own:
+        if (
+            found.fits
+            or found.promised_probability(compared) < _PROMISED_PROBABILITY
+            or parent.state.is_lost
+            or keyframes == own
+        ):
             return []
         query = self.query(parent, keyframes)
         origin, arc = PoseGaussian.from_pose(np.zeros(3)), uninformative_belief(query.belief.mean)
