@@ -180,3 +180,14 @@ def test_a_turn_that_odometry_missed_in_a_pause_is_found_by_a_scan_that_fits_the
     assert distance < 0.1
     assert angle < 2.0
     assert tracked.contradicts_odometry
+
+
+def test_a_reset_of_odometry_that_leads_to_a_place_that_looks_alike_is_not_believed(mapping):
+    """The reset is a step of 14 m in 0.2 s, into a room with the same walls but for a box."""
+    twin = np.concatenate((box(7.98, -4.03, 20.03, 7.01), box(9.98, 3.03, 10.48, 7.01)))
+    area_filter = map_walls(mapping, np.concatenate((ROOM, twin)), [(0, 0, 0), (14, 0, 0)])
+    truth, reset = np.array([0.1, 0.0, 0.02]), np.array([14.1, 0.0, 0.02])
+    inertia = RelativeMotion(truth, np.diag([0.05, 0.05, 0.1]) ** 2)
+    tracked = track(area_filter, ROOM, truth, RelativeMotion(reset, np.diag([1.4, 1.4, 0.01]) ** 2), inertia)
+    assert tracked.contradicts_odometry
+    np.testing.assert_allclose(area_filter.pose, truth, atol=0.02)

@@ -4,8 +4,9 @@ A scan is matched with the submap from the pose that odometry predicts, or from 
 
 Odometry is right or, with a small probability, uninformative (slip, lost readings); then inertia predicts the motion.
 Each of the two is a prior, and the prior under which scan and map have the larger evidence wins. In a uniform corridor
-both fit, and odometry as the sharper prior wins. Where a match is searched for, several poses may be probable: all of
-them are the match, each with its mass.
+both fit, and odometry as the sharper prior wins. Inertia is tried where odometry leads to no match, or jumps: a reset
+may lead to where the map looks alike. Where a match is searched for, several poses may be probable: all of them are the
+match, each with its mass.
 
 The uncertainty that a match leaves is propagated to the next scan. Otherwise, where a corridor shows little, the pose
 would stay at the first poor fit while the robot drives on. Where the uncertainty is large, the match is searched for.
@@ -196,7 +197,10 @@ class ScanMatcher:
         """
         by_odometry = self._match_with_prior(points, before, prediction.fused, view)
         best = self._select_best(points, by_odometry, view)
-        if prediction.odometry is None or self._agrees_with_prediction(points, best, view):
+        if prediction.odometry is None or (
+            self._agrees_with_prediction(points, best, view)
+            and (prediction.agrees_with_inertia or not best.hessian.any())
+        ):
             return self._select_modes(points, best, by_odometry, view)
         by_inertia = self._match_with_prior(points, before, prediction.inertia, view)
         best_by_inertia = self._select_best(points, by_inertia, view)
