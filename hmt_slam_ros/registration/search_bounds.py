@@ -316,6 +316,21 @@ class SquareRange(NamedTuple):
 
 
 @njit(cache=True)
+def _overlap(level: PhasedLevel, column: int, row: int, squares: SquareRange) -> tuple[int, int, int]:
+    """The squares of a lattice in which a point meets the level, as one run over the rows of both.
+
+    :param column: tile of the point without a shift, as ``row``.
+    :returns: the first row of the squares, the first value of the level, and their number, 0 where none meets it.
+    """
+    rows, columns = level.shape
+    width, column, row = columns + level.across, column + squares.left, row + squares.low
+    if not (-squares.across < column < columns and -squares.along < row < rows):
+        return 0, 0, 0
+    bottom, top = max(0, -row), min(squares.along, rows - row)
+    return bottom, level.across + (row + bottom) * width + column, (top - bottom - 1) * width + squares.across
+
+
+@njit(cache=True)
 def lattice_bounds(level: PhasedLevel, corners: Int32, classes: Int8, squares: SquareRange) -> Int32:
     """Bounds of the sum over the samples of a group in the squares of a lattice, steps.
 
@@ -325,20 +340,15 @@ def lattice_bounds(level: PhasedLevel, corners: Int32, classes: Int8, squares: S
     :param corners: shape (n, 2), of the group; ``classes``, shape (n,).
     :returns: shape (along, at least across).
     """
-    left, low, across, along = squares
-    rows, columns = level.shape
-    width = columns + level.across
+    along, width = squares.along, level.shape[1] + level.across
     totals, anywhere = np.zeros(along * width, np.int32), 0
     for n in range(corners.shape[0]):
         if classes[n] == TOO_WIDE:
             anywhere += TOP_STEPS
             continue
         x, y = corners[n, 0] + PAD, corners[n, 1] + PAD
-        column, row = x // TILES + left, y // TILES + low
-        if -across < column < columns and -along < row < rows:
-            bottom, top = max(0, -row), min(along, rows - row)
-            count = (top - bottom - 1) * width + across
-            first = level.across + (row + bottom) * width + column
+        bottom, first, count = _overlap(level, x // TILES, y // TILES, squares)
+        if count > 0:
             part, sums = level.rows[classes[n], y % TILES, x % TILES, first : first + count], totals[bottom * width :]
             for c in range(count):
                 sums[c] += part[c]
@@ -351,9 +361,7 @@ def count_known(level: PhasedLevel, corners: Int32, classes: Int8, squares: Squa
 
     The arguments and the shapes are those of :func:`lattice_bounds`.
     """
-    left, low, across, along = squares
-    rows, columns = level.shape
-    width = columns + level.across
+    along, width = squares.along, level.shape[1] + level.across
     counts, largest = np.zeros(along * width, np.int32), np.zeros(along * width, np.int8)
     for n in range(corners.shape[0]):
         if classes[n] == TOO_WIDE:
@@ -361,11 +369,8 @@ def count_known(level: PhasedLevel, corners: Int32, classes: Int8, squares: Squa
             largest[:] = TOP_STEPS
             continue
         x, y = corners[n, 0] + PAD, corners[n, 1] + PAD
-        column, row = x // TILES + left, y // TILES + low
-        if -across < column < columns and -along < row < rows:
-            bottom, top = max(0, -row), min(along, rows - row)
-            count = (top - bottom - 1) * width + across
-            first = level.across + (row + bottom) * width + column
+        bottom, first, count = _overlap(level, x // TILES, y // TILES, squares)
+        if count > 0:
             part = level.rows[classes[n], y % TILES, x % TILES, first : first + count]
             known, values = counts[bottom * width :], largest[bottom * width :]
             for c in range(count):
