@@ -11,7 +11,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import chi_square_gate, matrix_inverse
+from hmt_slam_ros.geometry.gaussian import matrix_inverse
 from hmt_slam_ros.sensors.odometry import Odometry, OdometryBuffer
 from hmt_slam_ros.sensors.relative_motion import NO_MOTION, RelativeMotion, increment_covariance, squared_accelerations
 from hmt_slam_ros.sensors.stale_odometry import MAX_STEPS, SteadyMotionSearch
@@ -34,12 +34,6 @@ _JUMP = 10.0
 _OUTLIER = 3.0
 """Deviations beyond which a step counts as slip, not as noise of the odometry."""
 
-_GATE = chi_square_gate(0.999)
-"""Squared Mahalanobis distance of odometry and inertia up to which they agree, 3 degrees of freedom."""
-
-_LEAST_VARIANCE = 1e-12
-"""Variance of a motion at least, m^2 and rad^2, so that those without uncertainty compare."""
-
 NOISY_FACTOR = 2.0
 """Factor on the deviations of the odometry model from which odometry counts as noisy."""
 
@@ -55,15 +49,6 @@ class Prediction(NamedTuple):
     odometry: RelativeMotion | None
     inertia: RelativeMotion
     fused: RelativeMotion
-
-    @property
-    def agrees_with_inertia(self) -> bool:
-        """Whether the robot can have moved as odometry says, or odometry is unknown."""
-        if self.odometry is None:
-            return True
-        difference = se2.log(se2.between(self.inertia.increment, self.odometry.increment))
-        spread = self.inertia.covariance + self.odometry.covariance + _LEAST_VARIANCE * np.eye(3)
-        return float(difference @ np.linalg.solve(spread, difference)) <= _GATE
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,7 +64,10 @@ _AMBIGUOUS = 3.0
 """Difference of the evidence below which two matches are equally good, nats: decision 0006."""
 
 _GATE = chi_square_gate(0.999)
-"""Squared Mahalanobis distance of match and odometry up to which they agree, 3 degrees of freedom."""
+"""Squared Mahalanobis distance up to which odometry agrees with a match, or with inertia; 3 degrees of freedom."""
+
+_LEAST_VARIANCE = 1e-12
+"""Variance of a motion at least, m^2 and rad^2, so that those without uncertainty compare."""
 
 T = TypeVar("T")
 
@@ -199,7 +202,7 @@ class ScanMatcher:
         best = self._select_best(points, by_odometry, view)
         if prediction.odometry is None or (
             self._agrees_with_prediction(points, best, view)
-            and (prediction.agrees_with_inertia or not best.hessian.any())
+            and not (best.hessian.any() and _jumps(prediction.odometry, prediction.inertia))
         ):
             return self._select_modes(points, best, by_odometry, view)
         by_inertia = self._match_with_prior(points, before, prediction.inertia, view)
@@ -426,6 +429,12 @@ class ScanMatcher:
 def _predict_pose(before: PoseGaussian, step: RelativeMotion) -> PoseGaussian:
     covariance = propagate_covariance(before.covariance, step.increment) + step.covariance
     return PoseGaussian(se2.compose(before.mean, step.increment), covariance)
+
+
+def _jumps(odometry: RelativeMotion, inertia: RelativeMotion) -> bool:
+    """Whether the robot can hardly have moved as odometry says."""
+    expected = PoseGaussian(inertia.increment, inertia.covariance + _LEAST_VARIANCE * np.eye(3))
+    return PoseGaussian(*odometry).mahalanobis2(expected) > _GATE
 
 
 def _mahalanobis2(pose: Float64, prior: scan_to_map.Prior) -> float:
