@@ -247,7 +247,7 @@ def map_visits(visits: Sequence[SimulatedLog], mode: str, before: MapAfterVisit 
     state = run.state
     result = run.finish()
     recording = result.recorder.finish(result.log_progress.stamps, result.log_progress.first_scans)
-    recording = final_map(recording, deskewed_scans(log, configuration), configuration).recording
+    recording = final_map(recording, partial(deskewed_scans, log, configuration), configuration).recording
     placed = keyframe_poses(recording.hybrid_map, recording.area_poses)
     scans, settings = [recording.replica.scans[k] for k in placed], configuration.local_map
     image = occupancy_image(scans, np.array(list(placed.values())), settings.cell, settings.max_range)

@@ -13,6 +13,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +109,7 @@ def map_and_monitor(
     memory.append((len(result.log_progress.stamps), resident_bytes()))
     begin, log_seconds = time.process_time(), log.seconds
     final = final_map(
-        result.recorder.finish(result.log_progress.stamps), deskewed_scans(log, configuration), configuration
+        result.recorder.finish(result.log_progress.stamps), partial(deskewed_scans, log, configuration), configuration
     )
     hybrid_map = final.recording.hybrid_map
     refinement = time.process_time() - begin - (log.seconds - log_seconds)

@@ -345,13 +345,15 @@ def test_a_closure_that_was_accepted_falsely_is_withdrawn_when_the_true_one_come
 def test_afterwards_the_map_is_as_if_it_had_never_been_there(drives):
     (one, _), (two, _) = drives
     assert list(one.area_poses) == list(two.area_poses)
-    for area, pose in one.area_poses.items():
-        assert np.hypot(*(two.area_poses[area].mean - pose.mean)[:2]) < 0.2
+    reference, *others = one.area_poses
+    np.testing.assert_array_equal(two.area_poses[reference].mean, one.area_poses[reference].mean)
+    for area in others:
+        assert two.area_poses[area].mahalanobis2(one.area_poses[area]) < BOUND
     scans = [r.measurement for r in open_log(LOG).records() if isinstance(r.measurement, Scan)]
-    final = [final_map(drive, iter(scans), Configuration()).recording.trajectory for drive in (one, two)]
+    final = [final_map(drive, lambda: scans, Configuration()).recording.trajectory for drive in (one, two)]
     apart = np.hypot(*se2.between(*final)[:, :2].T)
-    assert apart.mean() < 0.1
-    assert apart.max() < 0.2
+    assert apart.mean() < 0.05
+    assert apart.max() < 0.15
 
 
 def test_every_process_has_the_same_map_from_messages_alone(drives):

@@ -1,6 +1,7 @@
 """A map that a further log extends: poses of all logs in one frame, whatever the clocks of the logs say."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +58,8 @@ def extend_map(state, log):
     """The final map of a map and a further log, and how the logs were read."""
     result = run_log(log, Configuration(), state=state)
     recording = result.recorder.finish(result.log_progress.stamps, result.log_progress.first_scans)
-    return final_map(recording, deskewed_scans(log, Configuration()), Configuration()).recording, result.log_progress
+    scans = partial(deskewed_scans, log, Configuration())
+    return final_map(recording, scans, Configuration()).recording, result.log_progress
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 """The final refinement, from the small run of test_output_folder whose right answer is known."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from hmt_slam_ros.results import final_map as results_final_map
 from hmt_slam_ros.results.final_map import final_map
 from hmt_slam_ros.results.recorder import Recorder, Recording, keyframe_poses
 from hmt_slam_ros.results.trajectories import trajectory_in_map
+from hmt_slam_ros.results.trajectory_nodes import select_nodes
 from hmt_slam_ros.sensors import Scan
 
 
@@ -33,7 +35,7 @@ def test_where_no_scans_overlap_the_motion_that_metric_slam_found_stands() -> No
     recording = with_wrong_odometry(recorder.finish(STAMPS))
     replica = replace(recording.replica, scans={k: blind(seen) for k, seen in recording.replica.scans.items()})
     scans = [blind(scan(index)) for index in range(SCANS)]
-    found = final_map(replace(recording, replica=replica), scans, recorder.configuration).recording.trajectory
+    found = final_map(replace(recording, replica=replica), lambda: scans, recorder.configuration).recording.trajectory
     off = se2.between(TRUTH, found)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 1e-6
     assert np.abs(off[:, 2]).max() < 1e-6
@@ -43,6 +45,10 @@ def room_scan(index: int) -> Scan:
     """Two rooms with a door between them, from the true pose."""
     pose = se2.compose(np.array([2.0, 2.9, 0.0]), TRUTH[index])
     return scan_in(two_rooms(), pose, stamp=int(STAMPS[index]), beams=361)
+
+
+def room_scans() -> Iterator[Scan]:
+    return map(room_scan, range(SCANS))
 
 
 def room_recording(recorder: Recorder) -> Recording:
@@ -73,7 +79,7 @@ def with_arc(recording: Recording, offset: np.ndarray, covariance: np.ndarray) -
 
 def refined_arc(recording: Recording, configuration: Configuration) -> tuple[np.ndarray, tuple[Notice, ...]]:
     """Pose of area 1 in area 0 after the refinement, and its notices."""
-    final = final_map(recording, map(room_scan, range(SCANS)), configuration).recording
+    final = final_map(recording, room_scans, configuration).recording
     arc = final.hybrid_map.arc(0, 1)
     assert arc is not None
     return arc.mean, final.notices[len(recording.notices) :]
@@ -115,7 +121,7 @@ def test_a_result_with_which_the_scans_agree_less_is_not_kept(monkeypatch: pytes
         return se2.compose(poses, np.random.default_rng(1).normal(0.0, 0.3, poses.shape))
 
     monkeypatch.setattr(results_final_map, "refine_jointly", scatter)
-    final = final_map(recording, map(room_scan, range(SCANS)), recorder.configuration).recording
+    final = final_map(recording, room_scans, recorder.configuration).recording
     after = keyframe_poses(final.hybrid_map, final.area_poses)
     for keyframe, pose in before.items():
         np.testing.assert_allclose(after[keyframe], pose, atol=1e-12)
@@ -125,10 +131,8 @@ def test_a_notice_names_an_arc_that_was_left_by_more_than_it_allows(monkeypatch:
     recorder = make_recorder()
     right = room_recording(recorder)
     recording = with_arc(right, np.array([0.3, 0.0, 0.0]), np.diag([0.05, 0.05, 0.02]) ** 2)
-    poses = keyframe_poses(right.hybrid_map, right.area_poses)
-    monkeypatch.setattr(
-        results_final_map, "refine_jointly", lambda *_, **__: np.array([poses[k] for k in sorted(poses)])
-    )
+    nodes = select_nodes(right, recorder.configuration)
+    monkeypatch.setattr(results_final_map, "refine_jointly", lambda *_, **__: nodes.poses)
     _, (notice,) = refined_arc(recording, recorder.configuration)
     assert notice.text.startswith("area 1 moved by 0.30 m and 0.0 degrees as seen from area 0, more than their arc")
     allowed = with_arc(right, np.array([0.3, 0.0, 0.0]), np.diag([0.2, 0.05, 0.02]) ** 2)

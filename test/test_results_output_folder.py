@@ -163,7 +163,7 @@ def make_recorder(order: int = 0, without: type | None = None) -> Recorder:
 
 
 def finish_map(recorder: Recorder) -> FinalMap:
-    return final_map(recorder.finish(STAMPS), map(scan, range(SCANS)), recorder.configuration)
+    return final_map(recorder.finish(STAMPS), lambda: map(scan, range(SCANS)), recorder.configuration)
 
 
 def write(directory: Path, recorder: Recorder) -> None:

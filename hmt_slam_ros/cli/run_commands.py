@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -104,7 +105,7 @@ def run_measured(
     recording = result.recorder.finish(
         result.log_progress.stamps, result.log_progress.first_scans, result.log_progress.earlier_trajectory
     )
-    final = final_map(recording, deskewed_scans(log, configuration), configuration)
+    final = final_map(recording, partial(deskewed_scans, log, configuration), configuration)
     figures = RunMetrics(
         log=log.name,
         runtime="lock-step",

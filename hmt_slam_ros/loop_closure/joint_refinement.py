@@ -48,11 +48,8 @@ _TOLERANCE = 1e-3
 _EARLY_STRIDE = 2
 """One of so many points counts before the last linearization."""
 
-_PRIOR_INFORMATION = 0.1 * np.eye(3)
-"""Makes the information of a pair regular: 3 m and 3 rad."""
-
 _NEGLIGIBLE_INFORMATION = 1e-6 * np.eye(3)
-"""The same where it must not count, whatever the number of pairs: 1 km."""
+"""Makes the information of a pair regular, and does not count whatever the number of pairs: 1 km."""
 
 _SCALE = np.array([1.0, 1.0, 1.0 / 3.0])
 """Makes turns comparable with meters: a turn counts as it moves a point 3 m away."""
@@ -62,7 +59,7 @@ _MIN_INFORMATION_SHARE = 0.004
 
 
 _GATE = chi_square_gate(0.999)
-"""Largest squared Mahalanobis distance of a registration from what the arcs say of a pair."""
+"""Squared Mahalanobis distance up to which a registration is what the arcs admit, and a motion what odometry does."""
 
 
 class ScanPairs(NamedTuple):
@@ -213,6 +210,7 @@ def refine_jointly(
     options: RefinementParameters,
     fixed: int = 0,
     limits: PairLimits | None = None,
+    odometry: Edges | None = None,
 ) -> Float64:
     """The poses that agree best with all registrations and the motion between them.
 
@@ -222,6 +220,7 @@ def refine_jointly(
     :param motion_edges: edges of the motion, which connect all scans, also along the directions that walls leave open.
     :param fixed: the scan that stays.
     :param limits: None where all registrations count.
+    :param odometry: edges of the motion that may have the fault of a wheel.
     :returns: shape (n, 3).
     """
     gates = np.geomspace(options.first_gate, options.last_gate, options.iterations)
@@ -229,8 +228,20 @@ def refine_jointly(
         stride = _EARLY_STRIDE if k < len(gates) else 1
         registered = _register_pairs(surfaces, poses, pairs, gate, stride, options, limits)
         edges = concatenate_edges(motion_edges, registered)
+        if odometry is not None:
+            edges = concatenate_edges(edges, _limit_pull(odometry, poses))
         poses = optimize(poses, edges, fixed, marginals=False, tolerance=_TOLERANCE).poses
     return poses
+
+
+def _limit_pull(edges: Edges, poses: Float64) -> Edges:
+    """The edges with larger covariances beyond the gate, so that a fault pulls no more than at the gate (Huber 1964).
+
+    The cost stays convex: one step from a place to its correction spreads over the whole path.
+    """
+    off = se2.log(se2.between(edges.poses, se2.between(poses[edges.sources], poses[edges.targets])))
+    distance = np.sqrt(np.einsum("mi,mij,mj->m", off, _invert(edges.covariances), off) / _GATE)
+    return replace(edges, covariances=edges.covariances * np.maximum(1.0, distance)[:, None, None])
 
 
 def pair_limits(
@@ -285,16 +296,14 @@ def relative_beliefs(
 ) -> list[PoseGaussian]:
     """Beliefs over refined poses relative to each other, ``i_T_j``.
 
-    Overlapping pairs see the same walls and are not independent, so only a share of their information counts. Noise of
-    the normals gives each pair a little information along every direction, which would add up: it is dropped.
+    Overlapping pairs see the same walls and are not independent, so only a share of their information counts.
 
     :param poses: shape (n, 3), refined.
     :param motion_edges: edges of the motion, with their true covariances.
     :param between: shape (k, 2), scans i and j.
     """
     registered = _register_pairs(surfaces, poses, pairs, options.last_gate, 1, options)
-    information = options.certainty * _drop_weak_directions(_invert(registered.covariances)) + _NEGLIGIBLE_INFORMATION
-    edges = concatenate_edges(motion_edges, replace(registered, covariances=_invert(information)))
+    edges = concatenate_edges(motion_edges, replace(registered, covariances=registered.covariances / options.certainty))
     means = se2.between(poses[between[:, 0]], poses[between[:, 1]])
     return list(map(PoseGaussian, means, relative_covariances(poses, edges, between)))
 
@@ -303,12 +312,17 @@ def _invert(matrices: Float64) -> Float64:
     return np.linalg.inv(matrices).astype(np.float64, copy=False)
 
 
-def _drop_weak_directions(information: Float64) -> Float64:
-    """Information (m, 3, 3) without directions along which there is next to none."""
+def _known_directions(information: Float64) -> tuple[Float64, Float64]:
+    """Information (m, 3, 3) without directions along which there is next to none, and its pseudo-inverse (m, 3, 3).
+
+    Noise of the normals gives each pair a little information along every direction. Over many pairs it would add up.
+    """
     scale = np.outer(_SCALE, _SCALE)
     values, vectors = np.linalg.eigh(information * scale)
-    kept = np.where(values > _MIN_INFORMATION_SHARE * values[:, -1:], values, 0.0)
-    return np.asarray(np.einsum("mij,mj,mkj->mik", vectors, kept, vectors) / scale, dtype=np.float64)
+    known = values > _MIN_INFORMATION_SHARE * values[:, -1:]
+    kept = np.einsum("mij,mj,mkj->mik", vectors, np.where(known, values, 0.0), vectors) / scale
+    inverse = np.einsum("mij,mj,mkj->mik", vectors, np.where(known, 1.0 / np.where(known, values, 1.0), 0.0), vectors)
+    return kept, inverse * scale
 
 
 def _register_pairs(
@@ -329,8 +343,8 @@ def _register_pairs(
     information, gradient, share = normal_equations(
         surfaces, first, surfaces, second, relative, gate, weighting_from_options(options), stride
     )
-    information += _PRIOR_INFORMATION
-    step = -np.linalg.solve(information, gradient[..., None])[..., 0]
+    information, inverse = _known_directions(information)
+    step = -np.einsum("mij,mj->mi", inverse, gradient)
     measured = se2.compose(relative, se2.exp(step))
     counts = share >= pairs.min_share
     if limits is not None:
@@ -338,7 +352,9 @@ def _register_pairs(
         counts &= np.einsum("mi,mij,mj->m", offset, limits.information, offset) <= _GATE
         before, after = (_agreement(surfaces, pairs, at, gate, stride, options) for at in (limits.relative, measured))
         counts &= after >= before
-    return Edges(second[counts], first[counts], measured[counts], _invert(information[counts]))
+    return Edges(
+        second[counts], first[counts], measured[counts], _invert(information[counts] + _NEGLIGIBLE_INFORMATION)
+    )
 
 
 def concatenate_edges(motion: Edges, registered: Edges) -> Edges:

@@ -1,27 +1,26 @@
-"""The final map: joint refinement of all keyframes, and registration of all scans of the newest log with them."""
+"""The final map: joint refinement of the trajectory, and registration of all scans of the newest log with them."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.configuration.topology import RefinementParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.pose_graph import Edges
-from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs, uninformative_belief
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.loop_closure.closure_refinement import arc_edges, stack_edges
 from hmt_slam_ros.loop_closure.joint_refinement import (
+    ScanPairs,
     add_distant_pairs,
     certain_areas,
     concatenate_edges,
@@ -41,9 +40,9 @@ from hmt_slam_ros.registration.scan_to_scan import (
 )
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses
 from hmt_slam_ros.results.trajectories import Trajectory, trajectory_in_map
+from hmt_slam_ros.results.trajectory_nodes import follow_nodes, motion_edges, node_scans, select_nodes
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.sensors.odometry import OdometryBuffer, deskew_scan
-from hmt_slam_ros.sensors.relative_motion import path_covariance
 from hmt_slam_ros.sensors.scan import SweepCheck
 
 _ITERATIONS = 2
@@ -129,10 +128,10 @@ class FinalMap:
     stages: dict[str, Trajectory]
 
 
-def final_map(recording: Recording, scans: Iterable[Scan], configuration: Configuration) -> FinalMap:
+def final_map(recording: Recording, scans: Callable[[], Iterable[Scan]], configuration: Configuration) -> FinalMap:
     """Refine the map of a run, unless the mode is localization.
 
-    :param scans: all scans of the newest log in its order; those of earlier logs keep their poses to keyframes.
+    :param scans: reads all scans of the newest log in its order; those of earlier logs keep their poses to keyframes.
     """
     open_loop = trajectory_in_map(
         recording.relative_trajectory, keyframe_poses(recording.hybrid_map, _open_loop_area_poses(recording))
@@ -140,110 +139,97 @@ def final_map(recording: Recording, scans: Iterable[Scan], configuration: Config
     stages = {"filter": open_loop, "arcs": recording.trajectory}
     if not configuration.refinement.iterations or configuration.mode == "localization":
         return FinalMap(recording, stages)
-    refinement = _KeyframeRefinement(recording, configuration)
-    refined = _with_keyframe_poses(recording, refinement.refined_poses(recording))
+    refinement = _TrajectoryRefinement(recording, scans(), configuration)
+    refined = refinement.refined_recording(recording)
     refined = replace(refined, notices=recording.notices + _inconsistent_arcs(recording.hybrid_map, refined.hybrid_map))
     stages["keyframes"] = refined.trajectory
-    trajectory = refinement.registered_trajectory(refined, scans)
+    trajectory = refinement.registered_trajectory(refined, scans())
     relative = refined.relative_trajectory.with_trajectory(
         trajectory, keyframe_poses(refined.hybrid_map, refined.area_poses)
     )
     return FinalMap(replace(refined, trajectory=trajectory, relative_trajectory=relative), stages)
 
 
-class _KeyframeRefinement:
-    """Refinement of the n keyframes of the most probable map.
+class _TrajectoryRefinement:
+    """Refinement of the nodes of the trajectory in the most probable map.
 
-    :ivar ids: ids of the keyframes, ascending.
-    :ivar areas: shape (n,), area of each keyframe.
+    :ivar nodes: n of them, of which k are the keyframes.
     """
 
-    def __init__(self, recording: Recording, configuration: Configuration) -> None:
-        hybrid_map = recording.hybrid_map
-        area_of = {keyframe: area for area in hybrid_map.area_ids() for keyframe in hybrid_map.keyframes(area)}
+    def __init__(self, recording: Recording, scans: Iterable[Scan], configuration: Configuration) -> None:
         self._configuration = configuration
         self._options = configuration.refinement
-        self._linked = linked_areas(hybrid_map)
-        self.ids = sorted(area_of)
-        self.areas = np.array([area_of[keyframe] for keyframe in self.ids], dtype=np.int64)
-        self._surfaces = self._surfaces_of([recording.replica.scans[keyframe] for keyframe in self.ids])
+        self._linked = linked_areas(recording.hybrid_map)
+        self.nodes = select_nodes(recording, configuration)
+        self._surfaces = self._surfaces_of(node_scans(self.nodes, recording, scans))
 
     def _surfaces_of(self, scans: list[Scan]) -> ScanSurfaces:
         return extract_surfaces(scans, self._configuration.local_map.max_range, self._options.max_points)
 
-    def _poses(self, recording: Recording) -> NDArray[np.float64]:
-        poses = keyframe_poses(recording.hybrid_map, recording.area_poses)
-        return np.array([poses[keyframe] for keyframe in self.ids])
-
-    def _neighbor_rows(
+    def _nearest_keyframes(
         self, poses: NDArray[np.float64], seen_from: NDArray[np.float64], areas: NDArray[np.int64], count: int
     ) -> list[NDArray[np.int64]]:
-        return nearest_keyframes(poses, self.areas, seen_from, areas, self._linked, self._options.reach, count)
+        """The nodes of the nearest keyframes around m poses.
 
-    def refined_poses(self, recording: Recording) -> dict[int, NDArray[np.float64]]:
-        """{keyframe: ``map_T_base``} by joint refinement; the first keyframe is fixed.
+        :param poses: shape (n, 3), of the nodes.
+        :param seen_from: shape (m, 3); ``areas`` (m,) theirs.
+        """
+        own = np.flatnonzero(self.nodes.is_keyframe)
+        near = nearest_keyframes(
+            poses[own], self.nodes.areas[own], seen_from, areas, self._linked, self._options.reach, count
+        )
+        return [own[rows] for rows in near]
+
+    def refined_recording(self, recording: Recording) -> Recording:
+        """The recording with its nodes at the poses of the joint refinement; the first one is fixed.
 
         A registration counts where the arcs allow it and its two scans agree better than before. The result counts
         where all scans together agree better.
         """
-        hybrid_map, poses = recording.hybrid_map, self._poses(recording)
-        # One more neighbor, since each keyframe is the nearest to itself.
-        around = self._neighbor_rows(poses, poses, self.areas, self._options.neighbors + 1)
-        near = scan_pairs(around, self._options.min_share)
-        certain = certain_areas(hybrid_map, self._options.first_gate)
-        pairs = add_distant_pairs(near, self._surfaces, poses, self.areas, certain, self._options)
-        arcs = stack_edges(arc_edges(hybrid_map, hybrid_map.area_ids()), self.ids)
-        edges = concatenate_edges(self._motion_edges(recording, poses), arcs)
-        area_T_keyframe = np.array(
-            [hybrid_map.keyframes(area)[k] for k, area in zip(self.ids, self.areas.tolist(), strict=True)]
+        hybrid_map, nodes, poses = recording.hybrid_map, self.nodes, self.nodes.poses
+        pairs = self._pairs(hybrid_map)
+        arcs = stack_edges(arc_edges(hybrid_map, hybrid_map.area_ids()), nodes.keyframes[nodes.is_keyframe].tolist())
+        of_keyframe = np.flatnonzero(nodes.is_keyframe)
+        arcs = replace(arcs, sources=of_keyframe[arcs.sources], targets=of_keyframe[arcs.targets])
+        motion = motion_edges(nodes, recording, self._configuration.motion)
+        edges = concatenate_edges(motion.matched, arcs)
+        limits = pair_limits(hybrid_map, poses, pairs, nodes.areas, nodes.poses_in_area)
+        refined = refine_jointly(
+            self._surfaces, poses, pairs, edges, self._options, limits=limits, odometry=motion.odometry
         )
-        limits = pair_limits(hybrid_map, poses, pairs, self.areas, area_T_keyframe)
-        refined = refine_jointly(self._surfaces, poses, pairs, edges, self._options, limits=limits)
         before, after = (total_agreement(self._surfaces, at, pairs, self._options) for at in (poses, refined))
-        return dict(zip(self.ids, refined if after > before else poses, strict=True))
+        refined = refined if after > before else poses
+        keyframes = dict(zip(nodes.keyframes[of_keyframe].tolist(), refined[of_keyframe], strict=True))
+        return replace(_with_keyframe_poses(recording, keyframes), trajectory=follow_nodes(recording, nodes, refined))
 
-    def _motion_edges(self, recording: Recording, poses: NDArray[np.float64]) -> Edges:
-        """Edges from each keyframe to the next: the motion by metric SLAM, with the covariance of the odometry.
-
-        They hold keyframes whose scans overlap too little. The edge from one log to the next is uninformative.
-        """
-        rows, count = _scan_rows(recording, self.ids), len(poses) - 1
-        steps = se2.between(poses[:-1], poses[1:])
-        covariances = _path_covariances(recording.odometry, rows, self._configuration.motion)
-        logs = np.searchsorted(recording.first_scans, rows, side="right")
-        for n in np.flatnonzero(np.diff(logs)):
-            covariances[n] = uninformative_belief(steps[n]).covariance
-        return Edges(np.arange(count), np.arange(1, count + 1), steps, covariances)
+    def _pairs(self, hybrid_map: HybridMap) -> ScanPairs:
+        """Nodes that may overlap: each with the keyframes around it, and keyframes with those of distant passes."""
+        nodes, options = self.nodes, self._options
+        # One more neighbor, since each keyframe is the nearest to itself.
+        around = self._nearest_keyframes(nodes.poses, nodes.poses, nodes.areas, options.neighbors + 1)
+        few = options.scan_neighbors
+        around = [near if own else near[:few] for own, near in zip(nodes.is_keyframe.tolist(), around, strict=True)]
+        certain = certain_areas(hybrid_map, options.first_gate)
+        near_pairs = scan_pairs(around, options.min_share)
+        return add_distant_pairs(near_pairs, self._surfaces, nodes.poses, nodes.areas, certain, options)
 
     def registered_trajectory(self, recording: Recording, scans: Iterable[Scan]) -> Trajectory:
         """The trajectory with every scan of the newest log registered with the keyframes around it."""
-        poses, options = self._poses(recording), self._options
-        areas = self.areas[np.searchsorted(self.ids, np.maximum(recording.relative_trajectory.keyframes, self.ids[0]))]
+        nodes, options = self.nodes, self._options
+        own, area_of = nodes.is_keyframe, dict(zip(nodes.keyframes.tolist(), nodes.areas.tolist(), strict=True))
+        poses, by_keyframe = nodes.poses.copy(), keyframe_poses(recording.hybrid_map, recording.area_poses)
+        poses[own] = [by_keyframe[keyframe] for keyframe in nodes.keyframes[own].tolist()]
+        references = np.maximum(recording.relative_trajectory.keyframes, nodes.keyframes[0]).tolist()
+        areas = np.array([area_of[keyframe] for keyframe in references], dtype=np.int64)
         trajectory, remaining = recording.trajectory.copy(), iter(scans)
         for first in range(recording.first_scans[-1], len(trajectory), _BATCH):
             batch = list(itertools.islice(remaining, _BATCH))
             rows = slice(first, first + len(batch))
-            around = self._neighbor_rows(poses, trajectory[rows], areas[rows], options.scan_neighbors)
+            around = self._nearest_keyframes(poses, trajectory[rows], areas[rows], options.scan_neighbors)
             trajectory[rows] = register_scans(
                 self._surfaces, poses, self._surfaces_of(batch), trajectory[rows], around, options
             )
         return trajectory
-
-
-def _scan_rows(recording: Recording, keyframes: list[int]) -> NDArray[np.intp]:
-    """Numbers of the scans that became keyframes."""
-    stamps = [recording.replica.scans[keyframe].stamp for keyframe in keyframes]
-    return np.searchsorted(recording.stamps, stamps)
-
-
-def _path_covariances(odometry: Trajectory, rows: NDArray[np.intp], motion: MotionParameters) -> NDArray[np.float64]:
-    """Covariances of the odometry between n scans of the log, shape (n - 1, 3, 3)."""
-    steps = se2.between(odometry[:-1], odometry[1:])
-    distance = np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))[rows]
-    angle = np.concatenate(([0.0], np.cumsum(np.abs(steps[:, 2]))))[rows]
-    return np.array(
-        [path_covariance(*path, motion) for path in zip(np.diff(distance), np.diff(angle), strict=True)]
-    ).reshape(-1, 3, 3)
 
 
 def _with_keyframe_poses(recording: Recording, poses: Mapping[int, NDArray[np.float64]]) -> Recording:

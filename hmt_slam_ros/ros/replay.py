@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -191,7 +192,7 @@ def replay(
         run.run(log, _slam_arguments(contents.laser_poses))
         begin = time.process_time()
         recording = run.recorder_node.recorder.finish(contents.stamps)
-        final = final_map(recording, deskewed_scans(opened, configuration), configuration)
+        final = final_map(recording, partial(deskewed_scans, opened, configuration), configuration)
         refinement = time.process_time() - begin
         metrics = RunMetrics(
             log=opened.name,
