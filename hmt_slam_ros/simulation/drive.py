@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,8 @@ _ITERATIONS = 40
 """Iterations of the fixed point of `add_odometry_noise`."""
 
 
-class DrivePath(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class DrivePath:
     """A path of segments of constant curvature.
 
     :ivar starts: shape (n, 3), ``world_T_base`` at the begin of each, m and rad.
@@ -48,12 +49,22 @@ class DrivePath(NamedTuple):
     lengths: NDArray[np.float64]
     turns: NDArray[np.float64]
 
+    @cached_property
+    def ends(self) -> NDArray[np.float64]:
+        """Distance along the path of the end of each segment, shape (n,), m."""
+        return np.cumsum(self.lengths)
+
+    @cached_property
+    def begins(self) -> NDArray[np.float64]:
+        """Distance along the path of the begin of each segment, shape (n,), m."""
+        return self.ends - self.lengths
+
     @property
     def is_turn_in_place(self) -> NDArray[np.bool_]:
         """Whether segments are turns on the spot, shape (n,)."""
         return self.lengths == 0.0
 
-    @property
+    @cached_property
     def sizes(self) -> NDArray[np.float64]:
         """Size of each segment, shape (n,), m, or rad for turns on the spot."""
         return np.where(self.is_turn_in_place, np.abs(self.turns), self.lengths)
@@ -61,7 +72,8 @@ class DrivePath(NamedTuple):
     def poses_at(self, segments: NDArray[np.intp], offsets: NDArray[np.float64]) -> NDArray[np.float64]:
         """``world_T_base`` (k, 3) at offsets on segments, in the unit of `sizes`; both of shape (k,)."""
         share = offsets / self.sizes[segments]
-        twists = np.stack((self.lengths[segments], np.zeros(segments.size), self.turns[segments]), axis=1)
+        twists = np.zeros((segments.size, 3))
+        twists[:, 0], twists[:, 2] = self.lengths[segments], self.turns[segments]
         return se2.compose(self.starts[segments], se2.exp(share[:, None] * twists))
 
 

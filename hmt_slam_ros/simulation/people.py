@@ -63,12 +63,12 @@ class People:
         path = self.drive.path
         walked = np.mod(walked, 2.0 * self.spans)
         along = self.begins + np.minimum(walked, 2.0 * self.spans - walked)
-        ends = np.cumsum(path.lengths)
-        along = np.clip(along, 0.0, ends[-1] * (1.0 - 1e-12))
-        segments = np.searchsorted(ends, along, side="right")
-        poses = path.poses_at(segments, along - (ends - path.lengths)[segments])
-        left = np.stack((-np.sin(poses[:, 2]), np.cos(poses[:, 2])), axis=1)
-        return poses[:, :2] + self.lateral_offsets[:, None] * left
+        along = np.clip(along, 0.0, path.ends[-1] * (1.0 - 1e-12))
+        segments = np.searchsorted(path.ends, along, side="right")
+        poses = path.poses_at(segments, along - path.begins[segments])
+        poses[:, 0] -= self.lateral_offsets * np.sin(poses[:, 2])
+        poses[:, 1] += self.lateral_offsets * np.cos(poses[:, 2])
+        return poses[:, :2]
 
 
 class ReactivePeople:
@@ -95,7 +95,8 @@ class ReactivePeople:
         """
         people = self._people
         ahead = self._walked + people.speeds * seconds
-        distances = [np.hypot(*(p[:, :2] - robot[:2]).T) for p in (self.discs, people.positions(ahead))]
+        positions = people.positions(ahead)
+        distances = [np.hypot(*(p[:, :2] - robot[:2]).T) for p in (self.discs, positions)]
         near = distances[1] < _STOP_DISTANCE
         stop = near & (distances[1] < distances[0]) & ~self._squeezing
         self._walked = np.where(stop, self._walked, ahead)
@@ -106,7 +107,8 @@ class ReactivePeople:
         self._walked, self._waited = np.where(back, -self._walked, self._walked), np.where(tired, 0.0, self._waited)
         self._squeezing = near & (self._squeezing | (tired & turned))
         self._memory_times = np.where(back, _MEMORY_TIME, np.maximum(self._memory_times - seconds, 0.0))
-        positions = people.positions(self._walked)
+        if stop.any() or back.any():
+            positions = people.positions(self._walked)
         self.discs = _discs(np.where(self._squeezing[:, None], _push_away(positions, robot), positions))
 
 
