@@ -40,8 +40,8 @@ fi
 
 # Misspelled message fields and wrong types fail; nodes of other machines on the network are not seen.
 export ROS_PYTHON_CHECK_FIELDS=1 ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
-# The tests of nodes mostly wait; they run beside those that only compute (test/conftest.py).
-[ "$#" != 0 ] || set_of_all=(-n 2)
+# One worker for the tests of nodes, which often wait, and two for those that only compute (test/conftest.py).
+[ "$#" != 0 ] || set_of_all=(-n 3)
 check pytest ${set_of_all[@]+"${set_of_all[@]}"} "$@"
 [ "$#" != 0 ] || check benchmark short
 exit "$status"

@@ -32,23 +32,38 @@ LONG = (
 )
 
 
+def pytest_configure(config):
+    """What only computes leaves the processor to nodes, which have to react within a time."""
+    if os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0":
+        os.nice(10)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """One worker takes the files in which nodes run, the others what only computes, until nothing else is left.
+    """The first worker takes the files in which nodes run, the others what only computes.
 
-    Nodes wait for each other, and have to react within a time; six of them at once are enough for two cores.
+    Nodes wait for each other, and have to react within a time; six of them at once are enough for two cores. Of the
+    workers that have nothing left to compute, one helps the first.
     """
     from xdist.scheduler import LoadFileScheduling  # noqa: PLC0415  only where it is installed
 
     class NodesInTurn(LoadFileScheduling):
         def _assign_work_unit(self, node):
             runs_nodes = node is self.nodes[0]
-            names = {file: file.rpartition("/")[2] for file in self.workqueue}
-            for file in sorted(names, key=lambda file: not names[file].startswith(LONG)):
-                if names[file].startswith(NODES) == runs_nodes:
+            for file in sorted(self.workqueue, key=lambda file: not name_of(file).startswith(LONG)):
+                if name_of(file).startswith(NODES) == runs_nodes:
                     self.workqueue.move_to_end(file, last=False)
                     break
             super()._assign_work_unit(node)
+
+        def _reschedule(self, node):
+            if node in self.nodes[2:] and all(name_of(file).startswith(NODES) for file in self.workqueue):
+                node.shutdown()
+            else:
+                super()._reschedule(node)
+
+    def name_of(file):
+        return file.rpartition("/")[2]
 
     return NodesInTurn(config, log)
 

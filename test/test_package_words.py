@@ -5,7 +5,9 @@ import io
 import re
 import tokenize
 from collections import Counter
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -78,32 +80,47 @@ def name_of(path):
     return path.relative_to(ROOT if path.is_relative_to(ROOT) else PACKAGE.parent).as_posix()
 
 
-def definitions(path):
-    """Classes and functions of a file at any depth."""
-    return [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ClassDef | ast.FunctionDef)]
+class Words(NamedTuple):
+    """What is named and written in a file.
+
+    :ivar classes: names of classes at any depth.
+    :ivar functions: names of functions at any depth.
+    :ivar prose: docstrings and comments, each as (line, text).
+    :ivar identifiers: parameters and variables, each as (line, name).
+    """
+
+    classes: list[str]
+    functions: list[str]
+    prose: list[tuple[int, str]]
+    identifiers: list[tuple[int, str]]
 
 
-def prose_of(path):
-    """Docstrings and comments of a file, each as (line, text)."""
-    source = path.read_text()
-    documented = ast.Module | ast.ClassDef | ast.FunctionDef
+@cache
+def words_of(path):
+    """The words of a file."""
+    source, words = path.read_text(), Words([], [], [], [])
     for node in ast.walk(ast.parse(source)):
-        body = node.body if isinstance(node, documented) else []
-        for statement in body:
-            if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
-                yield statement.lineno, str(statement.value.value)
+        if isinstance(node, ast.ClassDef):
+            words.classes.append(node.name)
+        elif isinstance(node, ast.FunctionDef):
+            words.functions.append(node.name)
+        elif isinstance(node, ast.arg):
+            words.identifiers.append((node.lineno, node.arg))
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            words.identifiers.append((node.lineno, node.id))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            words.prose.extend(strings_of(node))
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
-            yield token.start[0], token.string
+            words.prose.append((token.start[0], token.string))
+    return words
 
 
-def identifiers_of(path):
-    """Names of parameters and variables of a file, each as (line, name)."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.arg):
-            yield node.lineno, node.arg
-        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            yield node.lineno, node.id
+def strings_of(node):
+    """Strings that are statements of their own in a module, a class or a function, each as (line, text)."""
+    for statement in node.body:
+        if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
+            yield statement.lineno, str(statement.value.value)
 
 
 def is_bare(name):
@@ -126,15 +143,15 @@ def test_a_class_name_has_one_meaning(folder):
 
 @pytest.mark.parametrize("path", python_files(*NAME_FOLDERS), ids=name_of)
 def test_names_are_the_fields_and_american(path):
-    names = {node.name.lstrip("_") for node in definitions(path)}
+    words = words_of(path)
+    names = {name.lstrip("_") for name in words.classes + words.functions}
     assert not names & BARE
     assert not {name for name in names if BRITISH.search(name.replace("_", " "))}
 
 
 @pytest.mark.parametrize("path", python_files(*PROSE_FOLDERS), ids=name_of)
 def test_functions_are_verbs_or_nouns(path):
-    functions = [node for node in definitions(path) if isinstance(node, ast.FunctionDef)]
-    assert not {node.name for node in functions if is_bare(node.name)} - ALLOWED_FUNCTIONS.keys()
+    assert not {name for name in words_of(path).functions if is_bare(name)} - ALLOWED_FUNCTIONS.keys()
 
 
 @pytest.mark.parametrize("path", python_files(*PROSE_FOLDERS), ids=name_of)
@@ -144,16 +161,17 @@ def test_prose_and_locals_have_no_retired_words(path):
     allowed = ALLOWED_PROSE.get(name_of(path), set())
     words = [
         (line, match.group())
-        for line, text in prose_of(path)
+        for line, text in words_of(path).prose
         for pattern in (RETIRED, BRITISH)
         for match in pattern.finditer(text)
         if match.group().lower() not in allowed
     ]
-    names = [(line, name) for line, name in identifiers_of(path) if name in RETIRED_NAMES - allowed]
+    names = [(line, name) for line, name in words_of(path).identifiers if name in RETIRED_NAMES - allowed]
     assert not words + names
 
 
 @pytest.mark.parametrize("path", python_files(ROOT / "test"), ids=name_of)
 def test_the_names_of_tests_have_no_retired_words(path):
-    names = [node.name.replace("_", " ") for node in definitions(path) if node.name.startswith("test_")]
+    words = words_of(path)
+    names = [name.replace("_", " ") for name in words.classes + words.functions if name.startswith("test_")]
     assert not [name for name in names if RETIRED.search(name) or BRITISH.search(name)]
