@@ -13,12 +13,17 @@ check() {
     "$venv/bin/python" -m "$@" || status=1
 }
 
-compile_kernels() {
+# What each worker would otherwise compile at the same time: kernels, and the tests with pytest's assertions.
+compile_all() {
     local folder
     folder=$(mktemp -d)
     "$venv/bin/hmt_slam" map data/malaga_one_loop --out "$folder/map" >/dev/null 2>&1
     rm -r "$folder"
+    "$venv/bin/python" -m pytest --collect-only -q >/dev/null 2>&1
 }
+
+# Where it is set, each of some hundred programs that tests start compiles the sources of the package.
+unset PYTHONDONTWRITEBYTECODE
 
 if [ "${1:-}" = --floor ]; then
     shift
@@ -27,8 +32,8 @@ if [ "${1:-}" = --floor ]; then
     export NUMBA_CACHE_DIR="$venv/numba_cache"
 else
     make_environment
-    # While mypy reads, as both workers of the tests would otherwise compile the same kernels at the same time.
-    [ "$#" != 0 ] || compile_kernels &
+    # While mypy reads.
+    [ "$#" != 0 ] || compile_all &
     check ruff check
     check ruff format --check
     check mypy
