@@ -29,6 +29,7 @@ NODES = ("test_ros_", "test_view_page", "test_package_compilation", "test_proces
 LONG = (
     *("test_docs_site", "test_exploration.py", "test_offline_", "test_write_faults", "test_benchmark_", "test_fuzzing"),
     *("test_ros_replay", "test_ros_hostile", "test_ros_faults", "test_ros_localization", "test_ros_saving"),
+    *("test_ros_explorer", "test_package_compilation"),
 )
 
 

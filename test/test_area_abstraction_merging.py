@@ -10,13 +10,13 @@ from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.hmt_map import MapWriter, read_saved_map
 
 # Corridors around four blocks: crossings are entered from several sides and at first taken for new ground.
-LOG = "sim:grid,seed=4,count=2"
+LOG, SECONDS = "sim:grid,seed=4,count=2", 220.0
 
 
 @pytest.fixture(scope="module")
 def drive():
     """What was recorded, and the replicas of slam, aam, tsbi and tlca; documents went through JSON."""
-    return run(open_log(LOG), Configuration())
+    return run(open_log(LOG, duration=SECONDS), Configuration())
 
 
 @pytest.fixture(scope="module")

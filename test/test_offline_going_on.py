@@ -61,16 +61,20 @@ def beginning(configuration, branching):
 def compare_runs(log, folder, stops, branching=lambda: Branching, configuration=None):
     """Compare a run that stops after some records with one that does not.
 
+    They are one until the first stop.
+
     :param stops: (number of the record, state of TSBI) -> whether it is saved then, and another goes on.
-    :param branching: makes what makes the children of hypotheses until it stops for the first time.
+    :param branching: makes what makes the children of hypotheses; those that go on have the usual.
     :param configuration: of both.
     :returns: the states of TSBI where it stopped.
     """
     configuration = configuration or Configuration()
-    whole, run, stopped = beginning(configuration, branching()), beginning(configuration, branching()), []
+    whole = run = beginning(configuration, branching())
+    stopped = []
     for number, record in enumerate(log.records()):
         whole.process_record(record)
-        run.process_record(record)
+        if run is not whole:
+            run.process_record(record)
         if stops(number, run._processes["tsbi"].state):
             state = run.state
             stopped.append(state.processes["tsbi"])
