@@ -82,20 +82,27 @@ def folders(tmp_path_factory):
 
 
 @pytest.fixture
-def map_twice(tmp_path, monkeypatch):
-    """Maps a log by nodes, which have their libraries loaded before, and in lock-step; returns the output folders."""
+def preloaded_nodes(monkeypatch):
+    """{node: process id of its last start}, for replays in this process: nodes have their libraries loaded before."""
+    pids = {}
 
-    def start_preloaded(command, **options):
-        return preloaded.start(*command[2:], **options)
+    def start(command, **options):
+        process = preloaded.start(*command[2:], **options)
+        pids[command[command.index(RUN_NODE) + 1]] = process.pid
+        return process
+
+    monkeypatch.setattr(node_processes, "subprocess", SimpleNamespace(**vars(subprocess) | {"Popen": start}))
+    return pids
+
+
+@pytest.fixture
+def map_twice(tmp_path, preloaded_nodes):
+    """Maps a log by nodes and in lock-step; returns the output folders."""
 
     def run(log, *settings):
         settings = ("robot.rate=0.0", *settings)
         nodes, lock_step = tmp_path / "replay", tmp_path / "map"
-        with monkeypatch.context() as patch:
-            patch.setattr(
-                node_processes, "subprocess", SimpleNamespace(**vars(subprocess) | {"Popen": start_preloaded})
-            )
-            replay(log, nodes, load_configuration(settings=settings))
+        replay(log, nodes, load_configuration(settings=settings))
         words = [word for setting in settings for word in ("--set", setting)]
         hmt_slam("map", log, "--out", lock_step, *words, check=True)
         return nodes, lock_step
@@ -156,14 +163,14 @@ def test_the_report_accounts_for_every_scan_and_every_process(folders):
     assert report["cpu_s"] > slam["total_s"]
 
 
-def test_processes_that_are_killed_one_after_the_other_go_on_to_the_same_bit(folders, tmp_path, capfd):
+def test_processes_that_are_killed_one_after_the_other_go_on_to_the_same_bit(folders, preloaded_nodes, tmp_path, capfd):
     """At last all of them at once. Scans, keyframe events and checkpoints are under way wherever that happens."""
     due = {20: ("rtl",), 45: ("tlca",), 75: ("tsbi",), 105: ("aam",), 135: ("slam",), 165: process_names()}
 
     def strike(scans):
         if due and scans >= min(due):
             for name in due.pop(min(due)):
-                os.kill(children_of(os.getpid())[name], signal.SIGKILL)
+                os.kill(preloaded_nodes[name], signal.SIGKILL)
 
     out = tmp_path / "out"
     replay(BUNDLED, out, load_configuration(settings=["robot.rate=0.0"]), strike)
