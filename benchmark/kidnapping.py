@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, repeat
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +22,8 @@ from benchmark.settings import Settings
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.evaluation import StampedPoses, evaluate_relations, true_relations
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs.records import SIMULATION_PREFIX
+from hmt_slam_ros.logs.records import SIMULATION_PREFIX, LogRecord
+from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.open_log import open_log
@@ -33,7 +34,7 @@ LOGS = ("aces", "intel")
 ALIKE = ("hall", "ring")
 """Worlds in which a kidnapping may be invisible, because the view is the same or empty."""
 
-KINDS = ("known", "unknown", "short")
+KINDS = ("known", "unknown", "short", "gap")
 SEEDS = 10
 
 SOON, SHARE = 5.0, 0.95
@@ -47,13 +48,15 @@ _DRAWS = 2009
 _JUMP = 0.6  # m and rad, in the time between two scans
 _STEP = 2.5  # m, by which a robot is moved in short kidnappings
 # Parts of the drive after which the robot is kidnapped, and from which it continues.
-_AT = {"known": (0.55, 0.7), "unknown": (0.15, 0.25), "short": (0.2, 0.7)}
-_TO = {"known": (0.72, 0.85), "unknown": (0.3, 0.4)}
+_AT = {"known": (0.55, 0.7), "unknown": (0.15, 0.25), "short": (0.2, 0.7), "gap": (0.55, 0.7)}
+_TO = {"known": (0.72, 0.85), "unknown": (0.3, 0.4), "gap": (0.72, 0.85)}
+_GAP = 4.0  # s, without scans from the kidnapping on, in those of kind gap
 
 POLICY = (
     "Two rounds of each world. The robot is kidnapped once, without odometry, and turned by up to 180 degrees: in the "
     f"second round to another part of it (known), in the first one to unmapped ground (unknown), or {_STEP:g} m "
-    "farther on its route (short). The kidnapping is noticed when the robot is not localized, or right. The robot is "
+    f"farther on its route (short); or as in known, with {_GAP:g} s without scans (gap). "
+    "The kidnapping is noticed when the robot is not localized, or right. The robot is "
     f"sure if hypotheses that are not lost have a probability of {SURE:g}. It is right within {_RIGHT:g} m and "
     f"{math.degrees(_RIGHT_ANGLE):.0f} degrees of the pose by the nearest keyframe of before, with {100 * _DRIFT:g} % "
     "of the distance to that added. Errors are those of metric SLAM's trajectory at relations within the parts before "
@@ -195,21 +198,44 @@ class MonitoredRun:
         return LocalizationReport(traveled, self.lost_probability() <= LOST_LIMIT, self.is_sure(), self.is_right(true))
 
 
-def drive_kidnapped(name: str, changes: Sequence[str] = ()) -> Kidnapping:
-    """Drive through a simulated world with a kidnapping."""
+def leave_gap(records: Iterable[LogRecord], seconds: float) -> Iterator[LogRecord]:
+    """The records without the scans of some seconds from the kidnapping on."""
+    last: NDArray[np.float64] | None = None
+    end = 0
+    for record in records:
+        if isinstance(record.measurement, Scan) and record.true_pose is not None:
+            if last is not None and _is_jump(last, record.true_pose):
+                end = record.measurement.stamp + round(seconds * NANOSECONDS)
+            last = record.true_pose
+            if record.measurement.stamp < end:
+                continue
+        yield record
+
+
+def _is_jump(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
+    """Whether the robot was kidnapped between two true poses, shape (3,)."""
+    step = se2.between(before, after)
+    return math.hypot(step[0], step[1]) > _JUMP or abs(float(step[2])) > _JUMP
+
+
+def drive_kidnapped(name: str, changes: Sequence[str] = (), gap: float = 0.0) -> Kidnapping:
+    """Drive through a simulated world with a kidnapping.
+
+    :param gap: time without scans from the kidnapping on, s.
+    """
     monitored, traveled = MonitoredRun(changes), 0.0
     reports: list[LocalizationReport] = []
     stamps, truth, parts = list[int](), list[NDArray[np.float64]](), list[bool]()
-    for record in open_log(name).records():
+    for record in leave_gap(open_log(name).records(), gap):
         before = monitored.events
         monitored.run.process_record(record)
         if not isinstance(record.measurement, Scan) or record.true_pose is None:
             continue
-        step = se2.between(truth[-1], record.true_pose) if truth else np.zeros(3)
-        if math.hypot(step[0], step[1]) > _JUMP or abs(step[2]) > _JUMP:
+        last = truth[-1] if truth else record.true_pose
+        if _is_jump(last, record.true_pose):
             monitored.kidnap_event = before
         elif monitored.kidnap_event >= 0:
-            traveled += math.hypot(step[0], step[1])
+            traveled += math.hypot(*(record.true_pose - last)[:2])
         stamps.append(record.measurement.stamp)
         truth.append(record.true_pose)
         parts.append(monitored.kidnap_event >= 0)
@@ -287,7 +313,8 @@ def measure_kidnapping(settings: Settings) -> Report:
         drives += [(world, f"{SIMULATION_PREFIX}{world},seed={seed},laps=2") for world in worlds for seed in seeds]
         with ProcessPoolExecutor(settings.runner.jobs, multiprocessing.get_context("spawn")) as pool:
             changes = settings.changes
-            found = list(pool.map(partial(drive_kidnapped, changes=changes), [draw_drive(*case) for case in cases]))
+            gaps = [_GAP if kind == "gap" else 0.0 for _, kind, _ in cases]
+            found = list(pool.map(drive_kidnapped, [draw_drive(*case) for case in cases], repeat(changes), gaps))
             ordinary_drives = list(pool.map(partial(drive_ordinary, changes=changes), [path for _, path in drives]))
     rows = []
     for world in worlds:

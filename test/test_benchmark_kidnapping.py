@@ -1,6 +1,7 @@
 """Scores of kidnapped robots by their localization."""
 
 import math
+from itertools import pairwise
 
 import pytest
 
@@ -10,10 +11,12 @@ from benchmark.kidnapping import (
     LocalizationReport,
     draw_drive,
     drive_kidnapped,
+    leave_gap,
     requirements,
     summarize_drive,
 )
 from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.sensors import Scan
 
 LOST, RIGHT, WRONG = (False, False, False), (True, True, True), (True, True, False)
 
@@ -52,7 +55,7 @@ def test_a_confident_wrong_answer_and_one_that_comes_late_are_faults():
 def test_the_robot_is_kidnapped_once_without_odometry(kind):
     log = open_log(draw_drive("ring", kind, 1))
     drive = log.scenario.settings
-    assert (drive.carried > 0.5) == (kind == "known")
+    assert (drive.carried > 0.5) == (kind in ("known", "gap"))
     assert drive.to > drive.carried
     poses = log.scenario.poses
     steps = [math.hypot(*step) for step in (poses[1:, :2] - poses[:-1, :2])]
@@ -61,6 +64,22 @@ def test_the_robot_is_kidnapped_once_without_odometry(kind):
     assert kind != "short" or far[0] < 3.0
     wheels = log.scenario.odometry
     assert max(math.hypot(*step) for step in wheels[1:, :2] - wheels[:-1, :2]) < 0.2
+
+
+def test_scans_are_missing_from_the_kidnapping_on():
+    log = open_log(draw_drive("ring", "gap", 1))
+    whole, parted = list(log.records()), list(leave_gap(log.records(), 2.0))
+    kept = {record.measurement.stamp for record in parted if isinstance(record.measurement, Scan)}
+    scans = [record for record in whole if isinstance(record.measurement, Scan)]
+    missing = [record.measurement.stamp for record in scans if record.measurement.stamp not in kept]
+    first = next(
+        later.measurement.stamp
+        for one, later in pairwise(scans)
+        if math.hypot(*(later.true_pose - one.true_pose)[:2]) > 0.6
+    )
+    assert missing[0] == first
+    assert missing[-1] - first < 2 * 10**9 <= min(stamp for stamp in kept if stamp > first) - first
+    assert len(whole) - len(parted) == len(missing)
 
 
 @pytest.mark.parametrize(
