@@ -165,7 +165,7 @@ RECORDER = NodeRow(
 """The recorder of both runtimes. In a replay, its node runs in the OS process that started the others."""
 
 DOCUMENTS: tuple[DocumentRow, ...] = (
-    DocumentRow(f"{_DOCUMENTS}:KeyframeHeader", "hmt/keyframes", "keyframe", 11),
+    DocumentRow(f"{_DOCUMENTS}:KeyframeHeader", "hmt/keyframes", "keyframe", 12),
     DocumentRow(f"{_MESSAGES}:AreaEvents", "hmt/area_events", "area_events", 4),
     DocumentRow(f"{_MESSAGES}:Hypotheses", "hmt/hypotheses", "hypotheses", 9),
     DocumentRow(f"{_MESSAGES}:ClosureDecision", "hmt/closure_decisions", "closure_decision", 1),

@@ -70,7 +70,7 @@ class Run:
         self.stored = True
         self.stale_beams = ()
 
-    def keyframe(self, true_pose, cut=0, moved=None, merged=None, mapping=True):
+    def keyframe(self, true_pose, cut=0, moved=None, merged=None, mapping=True, motion_condition="ordinary"):
         """One keyframe event; ``cut`` is how many of the newest keyframes leave the area, in every hypothesis.
 
         :param merged: an area, and the one that it becomes part of.
@@ -97,7 +97,15 @@ class Run:
             )
             for h in sorted(self.poses)
         )
-        message = Keyframe(sequence, scan, 0.5 * sequence, hypotheses, mapping=mapping, stale_beams=self.stale_beams)
+        message = Keyframe(
+            sequence,
+            scan,
+            0.5 * sequence,
+            hypotheses,
+            mapping=mapping,
+            stale_beams=self.stale_beams,
+            motion_condition=motion_condition,
+        )
         assert self.tsbi.handle(message) == []
         self.replica.add_keyframe(message)
         return self._answer(sequence, self._events(sequence, cut, moved, merged))

@@ -1,6 +1,7 @@
 """Metric SLAM where odometry is wrong, silent or missing."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from test_submap_scan_matcher import with_niches
 from worlds import box, scan_in
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.messages.messages import EndOfLog, LocalEstimate, Notice
+from hmt_slam_ros.messages.messages import EndOfLog, Keyframe, LocalEstimate, Notice
 from hmt_slam_ros.sensors import Odometry
 
 SECOND = 10**9
@@ -147,3 +148,66 @@ def test_without_odometry_a_robot_that_sets_off_along_a_corridor_is_followed(see
     distance, angle = errors(dialogue, truths)
     assert distance < 0.3
     assert angle < 1.5
+
+
+def keyframe_conditions(dialogue):
+    """{stamp of a keyframe, s: condition of the motion to it}."""
+    return {k.scan.stamp / SECOND: k.motion_condition for k in dialogue.messages_of(Keyframe)}
+
+
+def drive_with(change, count=80):
+    """The conditions over a straight drive of which ``change(k, stamp, odometry, scan)`` gives the messages."""
+    dialogue = Dialogue()
+    for k in range(count):
+        pose, stamp = np.array([0.1 * k, 0.0, 0.0]), SECOND + k * SECOND // 10
+        scan = scan_in(WALLS, pose, stamp=stamp, noise=0.01, seed=k)
+        dialogue.send(*change(k, stamp, pose, scan))
+    dialogue.send(EndOfLog())
+    return keyframe_conditions(dialogue)
+
+
+def test_an_ordinary_motion_is_one_that_scans_and_odometry_show():
+    found = drive_with(lambda _k, stamp, pose, scan: [Odometry(stamp, pose), scan])
+    assert len(found) > 12
+    assert set(found.values()) == {"ordinary"}
+
+
+@pytest.mark.parametrize(("missing", "condition"), [(8, "ordinary"), (15, "after_gap")])
+def test_the_first_keyframe_after_scans_were_missing_for_a_while_says_so(missing, condition):
+    absent = range(40, 40 + missing)
+    found = drive_with(lambda k, stamp, pose, scan: [Odometry(stamp, pose), *([] if k in absent else [scan])])
+    first = min(stamp for stamp in found if stamp >= 5.0 + 0.1 * missing)
+    assert found.pop(first) == condition
+    assert set(found.values()) == {"ordinary"}
+
+
+def test_a_clock_that_goes_back_is_a_gap():
+    def go_back(k, stamp, pose, scan):
+        stamp -= 2 * SECOND * (k >= 40)
+        return [Odometry(stamp, pose), replace(scan, stamp=stamp)]
+
+    found = list(drive_with(go_back).values())
+    assert found.count("after_gap") == 1
+    assert set(found) == {"ordinary", "after_gap"}
+
+
+def test_a_motion_that_scans_contradict_is_uncertain():
+    def slip(k, stamp, pose, scan):
+        return [Odometry(stamp, pose + np.array([0.0, 0.0, 0.7 * (k >= 40)])), scan]
+
+    found = drive_with(slip)
+    uncertain = [stamp for stamp, condition in found.items() if condition == "uncertain"]
+    assert uncertain
+    assert all(4.9 < stamp < 6.0 for stamp in uncertain)
+    assert found[max(found)] == "ordinary"
+
+
+def test_a_motion_that_neither_scans_nor_odometry_show_is_uncertain():
+    def blind(k, stamp, pose, scan):
+        if 40 <= k < 60:
+            return [replace(scan, ranges=np.full_like(scan.ranges, np.inf))]
+        return [Odometry(stamp, pose), scan]
+
+    found = drive_with(blind)
+    assert "uncertain" in {condition for stamp, condition in found.items() if 5.0 <= stamp < 7.5}
+    assert found[max(found)] == "ordinary"

@@ -45,7 +45,7 @@ for part in (*PARTS.values(), MapDocument, ChainState, ScanTable):
     records_of(part, RECORDS)
 
 
-FORM = (22, "9b2e0876bdb9bd13")
+FORM = (23, "3e02324452518ecc")
 """Version of the format, and the digest of all fields and types: a change of one is a change of both."""
 
 
@@ -151,6 +151,11 @@ def fill(value):
             "tsbi.json",
             put("hypothesis_states", 0, 1, "localization", "relocalized_area", value=7),
             r"relocalized_area = \[7\] is not areas of the hypothesis",
+        ),
+        (
+            "tsbi.json",
+            put("hypothesis_states", 0, 1, "kidnapping_counts", value=[["uncertain", {"events": 1, "kidnappings": 2}]]),
+            r"kidnapping_counts.*\.kidnappings = 2 is not at most the events",
         ),
         ("aam.json", put("partitions", 0, 1, "area", value=7), r"partitions\.area = 7 is not 0, the robot's area"),
         ("slam.json", put("live_hypotheses", 0, 1, "event", "anchor", value=9), r"anchor = 9 is not a keyframe of the"),

@@ -23,11 +23,13 @@ from hmt_slam_ros.topological_inference.global_localization import UNMAPPED_PRIO
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
 from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, HypothesisState, Lost, PoseInArea, Tracking
 from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
+from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingPriors
 from hmt_slam_ros.topological_inference.relocalization import KIDNAPPED_UNMAPPED_PRIOR
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 FAR, HERE = (30.0, 20.0), (0.0, 0.0)
-PRIOR = math.log(1e-5)
+PRIORS = KidnappingPriors.from_configuration(Configuration())
+PRIOR = PRIORS.log_odds("ordinary", {})
 
 
 ANGLE = np.array([[0, 0, 6, 0], [6, 0, 6, 3], [6, 3, 4, 3], [4, 3, 4, 5], [4, 5, 0, 5], [0, 5, 0, 0]], dtype=np.float64)
@@ -196,7 +198,7 @@ def test_without_mapping_it_is_lost_if_another_place_is_more_probable(world, off
     for event, pose in enumerate(PATH[:4], start=12):
         scan = scan_in(world, pose, noise=0.01, seed=event, field_of_view=2 * np.pi, beams=361)
         claimed = se2.between(PATH[0], pose) + np.array([off, 0.0, 0.0])
-        state = state.after_scan(event, -3.0, -3.0, PoseInArea(1, event, claimed))
+        state = state.after_scan(event, -3.0, -3.0, PRIORS, PoseInArea(1, event, claimed))
         branching.keep_scans(event, scan, state.unstored_poses)
     child = decide_without_mapping(branching, replace(parent, state=state), 15)
     assert since(child) == lost
@@ -207,7 +209,7 @@ def test_without_mapping_it_is_lost_if_another_place_is_more_probable(world, off
 @pytest.mark.parametrize(("lost", "stays"), [(11, True), (9, False)], ids=["false alarm", "was moved"])
 def test_the_false_alarm_is_at_the_odometry_pose_when_the_robot_is_lost(lost, stays):
     parent, branching, _ = rooms_apart((ROOM, OTHER), [FAR], 0.1)
-    alarm = FalseAlarm(PoseInArea(1, 10, PATH[2]), 0.4)
+    alarm = FalseAlarm(PoseInArea(1, 10, PATH[2]), 0.4, "ordinary")
     state = replace(parent.state, localization=Lost(lost, alarm))
     scan = scan_in(ROOM, PATH[3], field_of_view=2 * np.pi, beams=361)
     keyframe = Keyframe(11, scan, 1.0, (), motion_unknown=True, mapping=False)
@@ -229,7 +231,7 @@ def test_a_false_alarm_raises_the_probability_of_the_tracked_pose_only(at, found
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
     branches = {}
     for probability in (0.0, 0.4):
-        stay = FalseAlarm(PoseInArea(0, newest[0], np.array([at, 0.0, 0.0])), probability)
+        stay = FalseAlarm(PoseInArea(0, newest[0], np.array([at, 0.0, 0.0])), probability, "ordinary")
         state = replace(parent.state, localization=Lost(newest[0], stay))
         distribution = search_through(branching, replace(parent, state=state)).pose_distribution
         branches[probability] = max(
@@ -272,7 +274,7 @@ def test_tracking_is_reset_only_where_the_robot_is_lost_from_the_next_event_on(s
 
 def test_an_initial_pose_replaces_the_false_alarm():
     parent, branching, newest = rooms_apart((ROOM, OTHER, ROOM), [FAR, FAR], 0.1)
-    alarm = FalseAlarm(PoseInArea(1, newest[0], np.zeros(3)), 0.4)
+    alarm = FalseAlarm(PoseInArea(1, newest[0], np.zeros(3)), 0.4, "ordinary")
     state = replace(parent.state, localization=Lost(newest[0], alarm))
     initial_pose = InitialPose(0, PoseGaussian(se2.between(PATH[0], PATH[5]), np.diag([0.3, 0.3, 0.2]) ** 2))
     pose = parent.hybrid_map.keyframes(2)[newest[-1]]
@@ -317,17 +319,17 @@ def after_scans(scans, first=5):
     """The state after scans whose ends and walls contradict alike, by the sum of both, nats."""
     state = HypothesisState()
     for event, nats in enumerate(scans, start=first):
-        state = state.after_scan(event, -0.5 * nats, -0.5 * nats)
+        state = state.after_scan(event, -0.5 * nats, -0.5 * nats, PRIORS)
     return state
 
 
 def test_scans_that_contradict_add_up_and_are_remembered_in_the_next_area():
     state = after_scans((-0.3, 8.0, 5.0, 1.2))
-    odds, since = state.kidnapping_test(1e-5)
+    odds, since = state.kidnapping_test(PRIORS)
     assert since == 6
     # Changed surroundings explain a part of it.
     assert PRIOR + 7.0 + 4.0 + 0.2 - 2.0 < odds < PRIOR + 7.0 + 4.0 + 0.2
-    assert state.after_area_change({}).kidnapping_test(1e-5) == (odds, since)
+    assert state.after_area_change({}).kidnapping_test(PRIORS) == (odds, since)
     assert state.after_area_change({}).surroundings == state.surroundings
 
 
@@ -335,16 +337,16 @@ def test_scans_that_contradict_add_up_and_are_remembered_in_the_next_area():
 def test_contradictions_of_one_kind_make_no_kidnapping_probable(ends, walls):
     state = HypothesisState()
     for event in range(3):
-        state = state.after_scan(event, ends, walls)
-    assert math.log(1e-5) < state.kidnapping_test(1e-5)[0] < math.log(0.01)
+        state = state.after_scan(event, ends, walls, PRIORS)
+    assert PRIOR < state.kidnapping_test(PRIORS)[0] < math.log(0.01)
     both = after_scans((8.8,) * 3)
-    assert both.kidnapping_test(1e-5)[0] > math.log(100.0)
+    assert both.kidnapping_test(PRIORS)[0] > math.log(100.0)
 
 
 def test_small_contradictions_at_every_keyframe_are_clutter():
     state = after_scans((0.9,) * 20)
     assert not state.kidnapping_evidence
-    assert state.kidnapping_test(1e-5) == (-math.inf, 0)
+    assert state.kidnapping_test(PRIORS) == (-math.inf, 0)
 
 
 def test_an_inconsistency_passes_with_scans_that_fit():
@@ -353,12 +355,12 @@ def test_an_inconsistency_passes_with_scans_that_fit():
 
 
 def test_small_contradictions_before_the_onset_do_not_count():
-    assert after_scans((2.0, 9.0, 6.0)).kidnapping_test(1e-5)[1] == 6
+    assert after_scans((2.0, 9.0, 6.0)).kidnapping_test(PRIORS)[1] == 6
 
 
 def test_a_fifth_of_the_largest_evidence_can_be_the_onset_and_less_cannot():
     evidence = {4: 1.999, 5: 2.0, 6: 10.0}
-    assert HypothesisState(kidnapping_evidence=evidence).kidnapping_test(1e-5) == (pytest.approx(PRIOR + 12.0), 5)
+    assert HypothesisState(kidnapping_evidence=evidence).kidnapping_test(PRIORS) == (pytest.approx(PRIOR + 12.0), 5)
 
 
 def test_keyframes_of_a_kidnapped_robot_are_not_pruned_at_the_same_event():

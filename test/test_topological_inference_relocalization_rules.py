@@ -27,6 +27,7 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import (
     PoseInArea,
     Tracking,
 )
+from hmt_slam_ros.topological_inference.kidnapping_prior import EventCounts, KidnappingPriors
 
 OPTIONS = replace(Configuration().tsbi, relocalization_probability=0.8, relocalization_share=0.6, hint_probability=0.7)
 ARC = np.array([3.0, 1.0, 0.7])
@@ -305,7 +306,7 @@ def test_keyframes_on_unmapped_ground_are_not_searched_again(probability, is_unk
     pair = (candidate(1, [2.0, 1.0, 0.4]), probability)
     (child,) = search(Lost(21), pair)[2].children
     assert child.state.localization.unknown == (25 if is_unknown else -1)
-    alarm = FalseAlarm(PoseInArea(1, 40, np.array([3.0, 2.0, 0.5])), 0.7)
+    alarm = FalseAlarm(PoseInArea(1, 40, np.array([3.0, 2.0, 0.5])), 0.7, "after_gap")
     (child,) = search(Lost(21, false_alarm=alarm), pair)[2].children
     assert child.state.localization.unknown == -1
     branching, _, _ = search(Lost(21, unknown=22), pair)
@@ -388,7 +389,7 @@ def test_a_kidnapped_hypothesis_counts_its_evidence_once():
 
 
 def test_a_false_alarm_counts_where_its_keyframe_was_searched():
-    alarm = FalseAlarm(PoseInArea(1, 22, np.array([3.0, 2.0, 0.5])), 0.7)
+    alarm = FalseAlarm(PoseInArea(1, 22, np.array([3.0, 2.0, 0.5])), 0.7, "after_gap")
     hybrid_map = make_map()
     own = hybrid_map.keyframes(5)
     there = candidate(1, se2.compose(alarm.tracked_pose.pose, se2.between(own[22], own[21])))
@@ -424,7 +425,7 @@ def test_an_area_keeps_a_keyframe_when_others_begin_a_new_one(event, expected):
 
 @pytest.mark.parametrize(("since", "initial_pose", "stays"), [(30, None, True), (29, None, False), (30, 0, False)])
 def test_a_false_alarm_moves_to_the_odometry_pose_of_the_first_keyframe_alone(since, initial_pose, stays):
-    alarm = FalseAlarm(PoseInArea(1, 22, np.array([3.0, 2.0, 0.5])), 0.7)
+    alarm = FalseAlarm(PoseInArea(1, 22, np.array([3.0, 2.0, 0.5])), 0.7, "after_gap")
     keyframe = SimpleNamespace(sequence=30, initial_pose=initial_pose)
     pose = np.array([0.2, 0.4, 0.6])
     found = relocalization._update_false_alarm(make_parent(Lost(since, false_alarm=alarm)), keyframe, pose)
@@ -468,18 +469,37 @@ def test_an_initial_pose_of_a_lost_robot_is_that_of_its_newest_keyframe():
 
 
 @pytest.mark.parametrize(
+    ("pose", "tracked_keyframe", "kidnappings"),
+    [((0.0, 0.0, 0.0), 22, 0), ((3.0, 0.0, 0.0), 22, 1), ((3.0, 0.0, 0.0), 9, 0)],
+    ids=["false alarm", "elsewhere", "long ago"],
+)
+def test_a_relocalization_elsewhere_than_a_false_alarm_counts_as_a_kidnapping(pose, tracked_keyframe, kidnappings):
+    """That the robot is still lost counts as none: it is counted once."""
+    own = make_map().keyframes(5)
+    tracked = np.array([3.0, 2.0, 0.5])
+    alarm = FalseAlarm(PoseInArea(1, tracked_keyframe, tracked), 0.7, "after_gap")
+    there = se2.compose(tracked, se2.between(own[22], own[21])) + np.array(pose)
+    remembered = PoseInArea(1, 24, se2.compose(there, se2.between(own[21], own[24])))
+    pair = (candidate(1, there), 0.99)
+    lost, relocalized = search(Lost(21, false_alarm=alarm, candidate=remembered), pair)[2].children
+    assert lost.state.kidnapping_counts == {}
+    assert relocalized.state.kidnapping_counts == ({"after_gap": EventCounts(0, 1)} if kidnappings else {})
+
+
+@pytest.mark.parametrize(
     ("log_odds", "confirmed", "lost"), [(-0.1, False, False), (2.0, False, True), (2.0, True, False)]
 )
 def test_without_mapping_a_probable_kidnapping_that_no_match_refutes_loses_the_robot(
     monkeypatch, log_odds, confirmed, lost
 ):
     pose = PoseInArea(5, 30, np.array([1.0, 1.0, 0.3]))
-    prior = OPTIONS.kidnapping_prior
-    evidence = {29: 1.0, 30: log_odds - math.log(prior) - 1.0}
+    priors = KidnappingPriors(OPTIONS.kidnapping_prior, 0.01)
+    evidence = {29: 1.0, 30: log_odds - priors.log_odds("ordinary", {}) - 1.0}
     parent = make_parent(Tracking())
     state = replace(parent.state, kidnapping_evidence=evidence, unstored_poses={30: pose})
     monkeypatch.setattr(kidnapping, "_confirms_tracked_pose", lambda _branching, _parent, _since: confirmed)
-    child = kidnapping.decide_without_mapping(SimpleNamespace(options=OPTIONS), replace(parent, state=state), 30)
+    branching = SimpleNamespace(options=OPTIONS, kidnapping_priors=priors)
+    child = kidnapping.decide_without_mapping(branching, replace(parent, state=state), 30)
     assert child.state.is_lost is lost
     if log_odds > 0.0:
         assert child.state.kidnapping_evidence == child.state.unstored_poses == {}

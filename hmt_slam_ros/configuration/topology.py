@@ -92,7 +92,11 @@ class InferenceParameters:
         12.0, "An area with a keyframe this close to the robot's area is part of the local map.", 0.5, 200.0, "m"
     )
     kidnapping_prior: float = parameter(
-        1e-5, "Probability of a kidnapping per keyframe event; 1e-5 is one in 50 km.", 1e-12, 0.1, expert=True
+        1e-5,
+        "Probability of a kidnapping per keyframe event, before any was counted; 1e-5 is one in 50 km.",
+        1e-12,
+        0.1,
+        expert=True,
     )
     kidnapping_odds: float = parameter(
         3e-5, "Odds of a kidnapping at which a kidnapped hypothesis is spawned.", 1e-12, 1.0, expert=True

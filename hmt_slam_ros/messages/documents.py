@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.map_changes import InitialPose, StaleBeams
-from hmt_slam_ros.messages.messages import EndOfRun, HypothesisEstimate, Keyframe
+from hmt_slam_ros.messages.messages import EndOfRun, HypothesisEstimate, Keyframe, MotionCondition
 from hmt_slam_ros.plain_data import PlainDataReader, Reader, to_plain
 from hmt_slam_ros.process_table import DOCUMENTS
 from hmt_slam_ros.saved_map.folder import FileRecord
@@ -52,6 +52,7 @@ class KeyframeHeader:
     initial_pose: InitialPose | None
     mapping: bool
     stale_beams: tuple[StaleBeams, ...]
+    motion_condition: MotionCondition
 
     @classmethod
     def from_keyframe(cls, keyframe: Keyframe) -> KeyframeHeader:

@@ -32,6 +32,13 @@ from hmt_slam_ros.messages.tasks import GoalPose, PlaceEstimate, Task, TaskResul
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import Odometry, Scan
 
+MotionCondition = Literal["ordinary", "after_gap", "uncertain"]
+"""What the motion since the last keyframe event rests on.
+
+"ordinary": scans and odometry agree, or scans alone show it. "after_gap": scans were missing for a while, or stamps go
+back by as much. "uncertain": scans contradict the odometry, or show so little that the motion is wide.
+"""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HypothesisEstimate:
@@ -77,6 +84,7 @@ class Keyframe:
     :ivar initial_pose: initial pose of the robot, None where none was given.
     :ivar mapping: whether the map may change. A lost robot may add to it even where it may not.
     :ivar stale_beams: beams in the map of the only hypothesis that the last scans refute.
+    :ivar motion_condition: of the motion since the last keyframe.
     """
 
     sequence: int
@@ -87,6 +95,7 @@ class Keyframe:
     initial_pose: InitialPose | None = None
     mapping: bool = True
     stale_beams: tuple[StaleBeams, ...] = ()
+    motion_condition: MotionCondition = "ordinary"
 
 
 @dataclass(frozen=True, eq=False, slots=True)

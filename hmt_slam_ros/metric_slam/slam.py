@@ -37,6 +37,7 @@ from hmt_slam_ros.messages.messages import (
     Keyframe,
     LocalEstimate,
     Message,
+    MotionCondition,
     Notice,
     PoseReset,
     TrackingReset,
@@ -47,6 +48,7 @@ from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis, LiveHypothe
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.sensors.motion_model import MotionModel, MotionState, Prediction
 from hmt_slam_ros.sensors.odometry import deskew_scan
+from hmt_slam_ros.sensors.relative_motion import is_wide
 from hmt_slam_ros.submap.local_filter import FilterFactory, PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.particle_filter import ParticleFilters
@@ -71,6 +73,7 @@ class SlamState:
     :ivar reset_pending: whether tracking restarts at the next scan.
     :ivar lost: whether the robot may be anywhere in the map, under all hypotheses.
     :ivar initial_pose: pose at the next scan that a person gave, None without one.
+    :ivar motion_condition: of the motion since the last keyframe event.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
@@ -88,6 +91,7 @@ class SlamState:
     reset_pending: bool = True
     lost: bool = False
     initial_pose: InitialPose | None = None
+    motion_condition: MotionCondition = "ordinary"
 
 
 class MetricSlam:
@@ -255,7 +259,7 @@ class MetricSlam:
         self._motion, self._odometry_monitor = MotionModel(self._configuration.motion), OdometryMonitor()
         dropped = self._state.dropped_scans + len(self._scan_queue)
         self._scan_queue = self._scan_queue.empty_copy(self._motion.odometry)
-        self._state = replace(self._state, dropped_scans=dropped, reset_pending=True)
+        self._state = replace(self._state, dropped_scans=dropped, reset_pending=True, motion_condition="ordinary")
         return [TrackingReset(self._state.keyframe_events, self._state.processed_scans)]
 
     def _process_scan(self, scan: Scan) -> list[Message]:
@@ -294,8 +298,20 @@ class MetricSlam:
         best = tracked[self._replica.best_hypothesis]
         self._motion.observe(best.increment, best.information, best.contradicts_odometry)
         path_length = self._state.path_length + math.hypot(best.increment[0], best.increment[1])
-        self._state = replace(self._state, path_length=path_length)
+        condition = self._motion_condition(prediction, contradicted=best.contradicts_odometry)
+        self._state = replace(self._state, path_length=path_length, motion_condition=condition)
         return self._notices(self._odometry_monitor.add_scan(prepared.scan.stamp, prediction.odometry, best))
+
+    def _motion_condition(self, prediction: Prediction, *, contradicted: bool) -> MotionCondition:
+        """The condition of the motion since the last keyframe event, with one more scan.
+
+        :param contradicted: whether the scan contradicts odometry.
+        """
+        if prediction.after_gap or self._state.motion_condition == "after_gap":
+            return "after_gap"
+        if contradicted or is_wide(self._best_hypothesis.filter.tracking_covariance, self._configuration.filter):
+            return "uncertain"
+        return self._state.motion_condition
 
     @staticmethod
     def _notices(text: str | None) -> list[Message]:
@@ -328,6 +344,7 @@ class MetricSlam:
             initial_pose,
             self.is_mapping,
             combine_stale_beams(changes),
+            self._state.motion_condition,
         )
         self._replica.add_keyframe(keyframe)
         # An initial pose is kept for one more event: the next scan is searched for there, even if the robot stands.
@@ -337,6 +354,7 @@ class MetricSlam:
             awaiting_decision=True,
             reset_pending=False,
             initial_pose=initial_pose if after_reset else None,
+            motion_condition="ordinary",
         )
         return [*scan_poses, keyframe, *self._notices(self._odometry_monitor.check_noise(self._motion.noise))]
 

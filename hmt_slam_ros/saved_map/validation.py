@@ -305,8 +305,13 @@ def _check_joined_motion(motion: Any, path: str) -> None:  # noqa: ANN401
     require(motion.weights.min() > 0.0, f"{path}.weights", motion.weights, "positive")
 
 
+def _check_event_counts(counts: Any, path: str) -> None:  # noqa: ANN401
+    require(counts.kidnappings <= counts.events, f"{path}.kidnappings", counts.kidnappings, "at most the events")
+
+
 _CHECKS: Mapping[str, Callable[[Any, str], None]] = {
     "AamState": _check_aam,
+    "EventCounts": _check_event_counts,
     "GraphState": _check_graph,
     "LineFilterState": _check_lines,
     "LineMapState": _check_line_map,

@@ -44,11 +44,13 @@ class Prediction(NamedTuple):
     :ivar odometry: by odometry, None where that is unknown.
     :ivar inertia: by the last velocity.
     :ivar fused: by odometry, and by inertia as far as odometry is noisier than its model.
+    :ivar after_gap: whether scans were missing before this one, or its stamp goes back by as much.
     """
 
     odometry: RelativeMotion | None
     inertia: RelativeMotion
     fused: RelativeMotion
+    after_gap: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +111,11 @@ class Inertia:
         lasting = _TIME_CONSTANTS * np.tanh(interval / _TIME_CONSTANTS)
         spread = covariance * interval**2 + np.outer(error, error) + self._floor
         return RelativeMotion(se2.exp(state.velocity * lasting), spread), predicted
+
+    def is_gap(self, seconds: float) -> bool:
+        """Whether ``seconds`` since the last scan are far more than usual, and more than a velocity lasts."""
+        long_term = _moving_mean(self.state.long_term_period, seconds, _LONG_TERM_WEIGHT)
+        return seconds > max(_IRREGULAR * long_term, float(_TIME_CONSTANTS.min()))
 
     def observe(self, increment: Float64, information: Float64, odometry: RelativeMotion | None = None) -> None:
         """Update the velocity by the motion that was predicted last.
@@ -325,15 +332,17 @@ class MotionModel:
         self._state = replace(self._state, stamp=stamp)
         if last is None:
             return Prediction(None, NO_MOTION, NO_MOTION)
-        inertia = self._inertia.predict(max(0.0, 1e-9 * (stamp - last)))
+        seconds = 1e-9 * (stamp - last)
+        after_gap = self._inertia.is_gap(abs(seconds))
+        inertia = self._inertia.predict(max(0.0, seconds))
         if step is None:
             self._state = replace(self._state, since_keyframe=None, last_motion=None)
-            return Prediction(None, inertia, inertia)
+            return Prediction(None, inertia, inertia, after_gap)
         scaled = self.noise.scale(step)
         self._state = replace(
             self._state, since_keyframe=None if since is None else since.compose(step), last_motion=scaled
         )
-        return Prediction(scaled, inertia, self.noise.fuse(step, inertia))
+        return Prediction(scaled, inertia, self.noise.fuse(step, inertia), after_gap)
 
     def _odometry_motion(self, stamp: int) -> RelativeMotion | None:
         """The motion from the last scan by odometry, None where that is unknown at either end."""

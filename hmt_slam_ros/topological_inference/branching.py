@@ -51,6 +51,7 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import (
     Tracking,
     relative_covariance,
 )
+from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingPriors
 
 MIN_PROPOSAL_PROBABILITY = 0.5
 """Smallest probability of a hypothesis for which landmarks propose loops."""
@@ -95,6 +96,7 @@ class Branching:
     :ivar landmarks: their evidence on places and loops, where the configuration asks for it.
     :ivar unstored_scans: {keyframe event: scan} of scans that no map holds and that may still be matched.
     :ivar options: parameters of the inference.
+    :ivar kidnapping_priors: of a kidnapping before a keyframe event.
     """
 
     def __init__(
@@ -114,6 +116,7 @@ class Branching:
         self.search = ClosureSearch(configuration, scans)
         self.landmarks = None if landmarks is None else landmarks(configuration, scans)
         self.options = configuration.tsbi
+        self.kidnapping_priors = KidnappingPriors.from_configuration(configuration)
         self._filter = configuration.filter
         self._replica = replica
         sigma, angle = configuration.tlca.arc_sigma_floor, math.radians(configuration.tlca.arc_angle_floor)

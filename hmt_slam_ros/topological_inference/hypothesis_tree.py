@@ -15,8 +15,10 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, AreaPair, HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
+from hmt_slam_ros.messages.messages import MotionCondition
 from hmt_slam_ros.topological_inference.area_comparison import OngoingComparison
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseHint
+from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingCounts, KidnappingPriors, add_counts
 from hmt_slam_ros.topological_inference.surroundings_change import Surroundings
 
 Covariance = Float64
@@ -124,10 +126,12 @@ class FalseAlarm:
 
     :ivar tracked_pose: the robot's pose then.
     :ivar probability: of that, by the scans that made it lost.
+    :ivar motion_condition: of the motion in which it would have been kidnapped.
     """
 
     tracked_pose: PoseInArea
     probability: float
+    motion_condition: MotionCondition
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +193,8 @@ class HypothesisState:
         and for how many keyframe events in a row; or None.
     :ivar kidnapping_evidence: {keyframe event: CUSUM increment, nats} of the latest events since the robot may have
         been kidnapped.
+    :ivar onset_conditions: {event of these: condition of the motion to it} where that is not ordinary.
+    :ivar kidnapping_counts: counts of keyframe events and kidnappings, this map's.
     :ivar surroundings: what explains the contradictions if the robot was not kidnapped.
     :ivar unstored_poses: {event of these: the robot's pose} of scans that the map does not hold.
     :ivar localization: tracking, or lost.
@@ -202,6 +208,8 @@ class HypothesisState:
     comparison: OngoingComparison | None = None
     unlinked_overlap: tuple[int, int] | None = None
     kidnapping_evidence: Mapping[int, float] = field(default_factory=dict)
+    onset_conditions: Mapping[int, MotionCondition] = field(default_factory=dict)
+    kidnapping_counts: KidnappingCounts = field(default_factory=dict)
     surroundings: Surroundings = field(default_factory=Surroundings)
     unstored_poses: Mapping[int, PoseInArea] = field(default_factory=dict)
     localization: Tracking | Lost = field(default_factory=Tracking)
@@ -211,8 +219,19 @@ class HypothesisState:
         """Whether the hypothesis is lost."""
         return isinstance(self.localization, Lost)
 
+    def after_motion(self, event: int, condition: MotionCondition) -> HypothesisState:
+        """The state after the motion to a keyframe event, before its scan."""
+        counts = add_counts(self.kidnapping_counts, condition, events=1)
+        conditions = self.onset_conditions if condition == "ordinary" else {**self.onset_conditions, event: condition}
+        return replace(self, kidnapping_counts=counts, onset_conditions=conditions)
+
     def after_scan(
-        self, event: int, log_ends: float, log_walls: float, unstored_pose: PoseInArea | None = None
+        self,
+        event: int,
+        log_ends: float,
+        log_walls: float,
+        priors: KidnappingPriors,
+        unstored_pose: PoseInArea | None = None,
     ) -> HypothesisState:
         """The state after the scan of a keyframe event.
 
@@ -224,27 +243,65 @@ class HypothesisState:
         surroundings = self.surroundings.update(log_ends, log_walls)
         increment = -surroundings.log_likelihood - _CUSUM_DRIFT
         evidence = {k: nats for k, nats in self.kidnapping_evidence.items() if k > event - _CUSUM_WINDOW}
-        if evidence or increment > 0.0:
+        if evidence or increment > 0.0 or event in self.onset_conditions:
             evidence[event] = increment
-        if sum(evidence.values()) <= 0.0:
-            evidence = {}
+        evidence = self._relevant_evidence(evidence, priors)
         if not evidence and not self.kidnapping_evidence:
-            return replace(self, surroundings=surroundings)
+            return replace(self, surroundings=surroundings, onset_conditions={})
         poses = self.unstored_poses if unstored_pose is None else {**self.unstored_poses, event: unstored_pose}
-        unstored_poses = {k: pose for k, pose in poses.items() if k in evidence}
-        return replace(self, kidnapping_evidence=evidence, surroundings=surroundings, unstored_poses=unstored_poses)
+        return replace(
+            self,
+            kidnapping_evidence=evidence,
+            onset_conditions={k: condition for k, condition in self.onset_conditions.items() if k in evidence},
+            surroundings=surroundings,
+            unstored_poses={k: pose for k, pose in poses.items() if k in evidence},
+        )
 
-    def kidnapping_test(self, prior: float) -> tuple[float, int]:
+    def _relevant_evidence(self, evidence: dict[int, float], priors: KidnappingPriors) -> dict[int, float]:
+        """The evidence since the first event since which a kidnapping became more probable than an ordinary one.
+
+        That is the oldest event, or one after a motion that was not ordinary.
+        """
+        ordinary = priors.log_odds("ordinary", self.kidnapping_counts)
+        for first in sorted({*list(evidence)[:1], *self.onset_conditions.keys() & evidence.keys()}):
+            since = {event: nats for event, nats in evidence.items() if event >= first}
+            if self._prior_log_odds(first, priors) - ordinary + sum(since.values()) > 0.0:
+                return since
+        return {}
+
+    def _prior_log_odds(self, event: int, priors: KidnappingPriors) -> float:
+        return priors.log_odds(self.onset_condition(event), self.kidnapping_counts)
+
+    def kidnapping_test(self, priors: KidnappingPriors) -> tuple[float, int]:
         """Log-odds of a recent kidnapping, and the first keyframe event after it (CUSUM test, Page 1954).
 
-        :param prior: probability of a kidnapping per keyframe event.
+        Of the events that may be the first, and since which the scans contradict on the whole, it is the most probable:
+        the first one with enough evidence, or one after a motion that was not ordinary.
         """
-        if not self.kidnapping_evidence:
-            return -math.inf, 0
-        onset = _ONSET_SHARE * max(self.kidnapping_evidence.values())
-        first = min(event for event, nats in self.kidnapping_evidence.items() if nats >= onset)
-        statistic = sum(nats for event, nats in self.kidnapping_evidence.items() if event >= first)
-        return math.log(prior) + statistic, first
+        evidence = self.kidnapping_evidence
+        onset = _ONSET_SHARE * max(evidence.values(), default=0.0)
+        candidates = {event for event in evidence if event in self.onset_conditions}
+        candidates |= {min(event for event, nats in evidence.items() if nats >= onset)} if onset > 0.0 else set()
+        best = -math.inf, 0
+        for first in sorted(candidates):
+            statistic = sum(nats for event, nats in evidence.items() if event >= first)
+            log_odds = self._prior_log_odds(first, priors) + statistic
+            if statistic > 0.0 and log_odds > best[0]:
+                best = log_odds, first
+        return best
+
+    def onset_condition(self, event: int) -> MotionCondition:
+        """The condition of the motion to a keyframe event of the evidence."""
+        return self.onset_conditions.get(event, "ordinary")
+
+    def after_kidnapping(self, condition: MotionCondition) -> HypothesisState:
+        """The state of a hypothesis in which the robot was kidnapped in a motion."""
+        counts = add_counts(self.kidnapping_counts, condition, kidnappings=1)
+        return replace(self, kidnapping_counts=counts)
+
+    def without_kidnapping_evidence(self) -> HypothesisState:
+        """The state without the evidence of a kidnapping, once that was weighed."""
+        return replace(self, kidnapping_evidence={}, onset_conditions={})
 
     def after_keyframe(self, keyframe: int, covariance: Covariance) -> HypothesisState:
         """The state after a keyframe was stored in the robot's area."""
@@ -284,6 +341,8 @@ class HypothesisState:
             covariances,
             {area: keyframes for area, keyframes in matched.items() if keyframes},
             kidnapping_evidence=self.kidnapping_evidence,
+            onset_conditions=self.onset_conditions,
+            kidnapping_counts=self.kidnapping_counts,
             surroundings=self.surroundings,
             unstored_poses=self.unstored_poses,
             localization=self.localization if isinstance(self.localization, Lost) else Tracking(),

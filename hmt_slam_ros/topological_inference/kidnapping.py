@@ -35,7 +35,7 @@ _MIN_KIDNAPPED_KEYFRAMES = 3
 
 def spawn_kidnapped_hypothesis(branching: Branching, parent: Parent) -> Branches | None:
     """The children "not kidnapped" and "kidnapped", or None where a kidnapping is too improbable."""
-    log_odds, since = parent.state.kidnapping_test(branching.options.kidnapping_prior)
+    log_odds, since = parent.state.kidnapping_test(branching.kidnapping_priors)
     keyframes = _keyframes_since(parent, since)
     if (
         log_odds < math.log(branching.options.kidnapping_odds)
@@ -44,7 +44,9 @@ def spawn_kidnapped_hypothesis(branching: Branching, parent: Parent) -> Branches
     ):
         return None
     kidnapped = _kidnapped_child(branching, parent, keyframes, log_odds)
-    return Branches([parent.unchanged_child(replace(parent.state, kidnapping_evidence={})), kidnapped], True)
+    counted = kidnapped.state.after_kidnapping(parent.state.onset_condition(since))
+    stays = parent.unchanged_child(parent.state.without_kidnapping_evidence())
+    return Branches([stays, replace(kidnapped, state=counted)], True)
 
 
 def decide_without_mapping(branching: Branching, parent: Parent, event: int) -> Child:
@@ -55,13 +57,14 @@ def decide_without_mapping(branching: Branching, parent: Parent, event: int) -> 
 
     :param event: the newest; metric SLAM resets its filters at the next one.
     """
-    log_odds, since = parent.state.kidnapping_test(branching.options.kidnapping_prior)
+    log_odds, since = parent.state.kidnapping_test(branching.kidnapping_priors)
     state = parent.state
     if log_odds > 0.0:
         if not _confirms_tracked_pose(branching, parent, since):
-            alarm = FalseAlarm(state.unstored_poses[event], 1.0 / (1.0 + math.exp(log_odds)))
+            probability = 1.0 / (1.0 + math.exp(log_odds))
+            alarm = FalseAlarm(state.unstored_poses[event], probability, state.onset_condition(since))
             state = replace(state, localization=Lost(event + 1, false_alarm=alarm))
-        state = replace(state, kidnapping_evidence={}, unstored_poses={})
+        state = replace(state.without_kidnapping_evidence(), unstored_poses={})
     return parent.unchanged_child(state)
 
 
@@ -105,5 +108,5 @@ def _kidnapped_child(branching: Branching, parent: Parent, keyframes: Sequence[i
         lost = replace(lost, candidate=candidate, fitting_areas=fitting_areas, searched=max(query.poses))
     else:
         lost = replace(lost, search=search)
-    state = replace(child.state, kidnapping_evidence={}, surroundings=Surroundings(), localization=lost)
+    state = replace(child.state.without_kidnapping_evidence(), surroundings=Surroundings(), localization=lost)
     return replace(child, state=state)

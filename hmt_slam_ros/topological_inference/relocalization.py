@@ -241,7 +241,8 @@ def _conclude_search(
         parent.hybrid_map, lost, candidate, poses
     ):
         reference = se2.compose(keyframes[newest], se2.inverse(poses[newest]))
-        children = _split_at_candidate(parent, with_candidate, reference, candidate, probability)
+        still_lost, relocalized = _split_at_candidate(parent, with_candidate, reference, candidate, probability)
+        children = [still_lost, _count_kidnapping(parent.hybrid_map, relocalized, lost, candidate, poses)]
     else:
         children = [_child_with_localization(parent, with_candidate)]
     return Branches(children, True, pose_distribution=distribution)
@@ -257,6 +258,22 @@ def _after_refutation(lost: Lost, distribution: PoseDistribution, poses: Mapping
     if lost.pose_hint is not None:
         return replace(lost, pose_hint=None)
     return lost if lost.false_alarm is not None else replace(lost, unknown=max(poses))
+
+
+def _count_kidnapping(
+    hybrid_map: HybridMap, relocalized: Child, lost: Lost, candidate: PoseCandidate, poses: Mapping[int, Pose]
+) -> Child:
+    """The child with one more kidnapping, if it is relocalized elsewhere than the robot was tracked.
+
+    :param poses: {keyframe: ``reference_T_base``} of those that were searched.
+    """
+    alarm = lost.false_alarm
+    if alarm is None or alarm.tracked_pose.keyframe not in poses:
+        return relocalized
+    found = _pose_in_area(candidate, poses, alarm.tracked_pose.keyframe)
+    if _is_same_place(hybrid_map, found, alarm.tracked_pose):
+        return relocalized
+    return replace(relocalized, state=relocalized.state.after_kidnapping(alarm.motion_condition))
 
 
 def _split_at_candidate(

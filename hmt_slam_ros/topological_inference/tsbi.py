@@ -165,7 +165,7 @@ class Tsbi:
         self._replica.add_keyframe(keyframe)
         self._keyframe = keyframe
         self._estimates = {estimate.hypothesis: estimate for estimate in keyframe.estimates}
-        states = dict(self._state.hypothesis_states)
+        states, priors = dict(self._state.hypothesis_states), self._branching.kidnapping_priors
         for estimate in keyframe.estimates:
             if estimate.hypothesis not in states:
                 continue
@@ -174,7 +174,8 @@ class Tsbi:
                 unstored_pose = PoseInArea(estimate.area, keyframe.sequence, estimate.pose.mean)
             state = states[estimate.hypothesis]
             log_walls = -estimate.log_kidnapping_ratio - estimate.log_evidence
-            state = state.after_scan(keyframe.sequence, estimate.log_evidence, log_walls, unstored_pose)
+            state = state.after_motion(keyframe.sequence, keyframe.motion_condition)
+            state = state.after_scan(keyframe.sequence, estimate.log_evidence, log_walls, priors, unstored_pose)
             if estimate.stored:
                 state = state.after_keyframe(keyframe.sequence, estimate.pose.covariance)
             states[estimate.hypothesis] = state
