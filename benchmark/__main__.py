@@ -53,6 +53,7 @@ MEASUREMENTS = {
     "table": "time and memory against a global metric RBPF at equal accuracy (Table II)",
     "oracle": "TSBI's PMF against an exact enumeration of all topologies",
     "weighing": "hypotheses weighed by the filter's evidence, Eq. (14), instead of contradictions",
+    "modes": "the distribution of the pose over a doorway, scan by scan",
     "awakening": "global localization in a saved map",
     "kidnapping": "recovery of a robot that is kidnapped while it drives",
     "laps": "memory, cost and errors over repeated laps on known ground",
