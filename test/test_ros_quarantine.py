@@ -159,6 +159,7 @@ def test_a_journal_with_an_input_on_which_the_process_fails_is_recovered_once_an
     node.send(2, 1.0)
     node.until(lambda: node.last_count() == "decisions: 3")
     node.kill()
+    node.notices.clear()
     (generation,) = (path for path in (tmp_path / "recovery" / NAME).iterdir() if path.name.isdecimal())
     arrays = generation / "0.bin"
     content = arrays.read_bytes()
