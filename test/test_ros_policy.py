@@ -113,6 +113,7 @@ def test_running_nodes_use_what_their_enclaves_allow(listener, start, nodes):
     reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     names = {f"/{name}" for name in nodes}
     listener.until(lambda: {status.name for one in reported for status in one.status} >= names, alive=processes)
+    listener.until(lambda: set(listener.node.get_node_names()) >= set(nodes), alive=processes)
     assert_permissions(listener, nodes)
 
 
