@@ -203,6 +203,12 @@ class Edges:
     covariances: Float64
 
 
+def edge_chi2(edges: Edges, poses: Float64) -> Float64:
+    """Chi-square of each edge at given poses (n, 3), 3 degrees of freedom, shape (m,)."""
+    residuals = se2.log(se2.between(edges.poses, se2.between(poses[edges.sources], poses[edges.targets])))
+    return np.asarray(np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(edges.covariances), residuals))
+
+
 @dataclass(frozen=True, eq=False)
 class Solution:
     """The most likely poses.

@@ -19,7 +19,7 @@ from hmt_slam_ros.configuration.topology import RefinementParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, propagate_covariance
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.pose_graph import Edges, optimize, relative_covariances
+from hmt_slam_ros.hybrid_map.pose_graph import Edges, edge_chi2, optimize, relative_covariances
 from hmt_slam_ros.hybrid_map.shortest_path import connected_neighbors, shortest_path_beliefs
 from hmt_slam_ros.registration.scan_to_scan import (
     ScanSurfaces,
@@ -239,8 +239,7 @@ def _limit_pull(edges: Edges, poses: Float64) -> Edges:
 
     The cost stays convex: one step from a place to its correction spreads over the whole path.
     """
-    off = se2.log(se2.between(edges.poses, se2.between(poses[edges.sources], poses[edges.targets])))
-    distance = np.sqrt(np.einsum("mi,mij,mj->m", off, _invert(edges.covariances), off) / _GATE)
+    distance = np.sqrt(edge_chi2(edges, poses) / _GATE)
     return replace(edges, covariances=edges.covariances * np.maximum(1.0, distance)[:, None, None])
 
 

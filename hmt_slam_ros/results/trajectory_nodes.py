@@ -18,7 +18,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import chi_square_gate
-from hmt_slam_ros.hybrid_map.pose_graph import Edges
+from hmt_slam_ros.hybrid_map.pose_graph import Edges, edge_chi2
 from hmt_slam_ros.hybrid_map.shortest_path import map_pieces, uninformative_belief
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses
 from hmt_slam_ros.results.trajectories import Trajectory
@@ -134,8 +134,8 @@ def motion_edges(nodes: TrajectoryNodes, recording: Recording, motion: MotionPar
     odometry = recording.odometry[nodes.rows]
     by_slam, by_odometry = (se2.between(poses[:-1], poses[1:]) for poses in (nodes.poses, odometry))
     covariances = _path_covariances(recording.odometry, nodes.rows, motion)
-    off = se2.log(se2.between(by_odometry, by_slam))
-    is_fault = np.einsum("mi,mij,mj->m", off, np.linalg.inv(covariances), off) > _GATE
+    every = np.ones(len(by_slam), np.bool_)
+    is_fault = edge_chi2(_chain_edges(by_odometry, covariances, every), nodes.poses) > _GATE
     piece_of = {area: number for number, piece in enumerate(map_pieces(recording.hybrid_map)) for area in piece}
     pieces = np.array([piece_of[area] for area in nodes.areas.tolist()])
     matched = (is_fault & nodes.is_keyframe[:-1] & nodes.is_keyframe[1:]) | (np.diff(pieces) != 0)
