@@ -16,11 +16,11 @@ from hmt_slam_ros.loop_closure.joint_refinement import (
     PairLimits,
     ScanPairs,
     add_distant_pairs,
+    agree_better,
     nearest_keyframes,
     pair_limits,
     relative_beliefs,
     scan_pairs,
-    total_agreement,
 )
 from hmt_slam_ros.registration.scan_to_scan import extract_surfaces, normal_equations, weighting_from_options
 
@@ -109,16 +109,26 @@ def test_a_registration_counts_only_where_the_scans_agree_better_than_before(sur
     assert (1, 2) not in counted_pairs(surfaces, poses, PairLimits(before, free))
 
 
-def test_agreement_is_the_sum_of_the_weights_of_points_and_lets_outliers_count_for_little(surfaces):
+def test_scans_agree_better_the_nearer_their_walls_are_and_not_at_all_when_torn_apart(surfaces):
     pair = ScanPairs(PAIRS.rows[:1], PAIRS.min_share[:1])
-    totals = []
-    for offset in (0.0, 0.02, 0.1, 30.0):
-        poses = POSES.copy()
+    nearer_first = [POSES.copy() for _ in range(4)]
+    for poses, offset in zip(nearer_first, (0.0, 0.03, 0.2, 30.0), strict=True):
         poses[1] = se2.compose(POSES[1], [offset, 0.0, 0.0])
-        totals.append(total_agreement(surfaces, poses, pair, OPTIONS))
-    assert totals[0] > totals[1] > totals[2] > totals[3] == 0.0
-    count = surfaces.starts[1]
-    assert totals[0] <= count * OPTIONS.temper / OPTIONS.sigma**2
+    for i, before in enumerate(nearer_first):
+        for j, after in enumerate(nearer_first[:3]):
+            # A pair that did not overlap before does not count.
+            assert agree_better(surfaces, before, after, pair, OPTIONS) == (j < i < 3)
+        assert not agree_better(surfaces, before, nearer_first[3], pair, OPTIONS)
+
+
+def test_scans_that_see_less_of_the_same_walls_may_agree_better():
+    """In a bare corridor they are 2 m apart, and were taken for one place, to 3 cm."""
+    corridor = np.array([[-30.0, -1.0, 30.0, -1.0], [-30.0, 1.0, 30.0, 1.0]])
+    truth = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    scans = [scan_in(corridor, pose, beams=181, noise=0.005, seed=k) for k, pose in enumerate(truth)]
+    before = np.array([[0.0, 0.0, 0.0], [0.0, 0.03, 0.0]])
+    pair = ScanPairs(np.array([[0, 1]]), np.array([0.1]))
+    assert agree_better(extract_surfaces(scans, 8.0, 181), before, truth, pair, OPTIONS)
 
 
 def test_pairs_of_two_areas_are_limited_by_the_arcs_between_them():

@@ -264,25 +264,36 @@ def pair_limits(
     return PairLimits(se2.between(poses[second], poses[first]), information)
 
 
-def total_agreement(surfaces: ScanSurfaces, poses: Float64, pairs: ScanPairs, options: RefinementParameters) -> float:
-    """How much all pairs of scans agree at given poses, shape (n, 3): the sum of the weights of their points."""
+def agree_better(
+    surfaces: ScanSurfaces, before: Float64, after: Float64, pairs: ScanPairs, options: RefinementParameters
+) -> bool:
+    """Whether the pairs of scans agree better at the poses ``after`` than ``before``, both of shape (n, 3).
+
+    A pair counts as much as it overlapped before, so that one that was torn apart counts against the poses after.
+    """
     first, second = pairs.rows.T
-    return float(
-        _agreement(surfaces, pairs, se2.between(poses[second], poses[first]), options.last_gate, 1, options).sum()
+    (mean, count), (mean_after, _) = (
+        _mean_weights(surfaces, pairs, se2.between(poses[second], poses[first]), options.first_gate, 1, options)
+        for poses in (before, after)
     )
+    return bool(count @ mean_after > count @ mean)
 
 
-def _agreement(
+def _mean_weights(
     surfaces: ScanSurfaces, pairs: ScanPairs, relative: Float64, gate: float, stride: int, options: RefinementParameters
-) -> Float64:
-    """The sum of the weights of each pair's points at given relative poses, shape (m, 3), which outliers cannot raise.
+) -> tuple[Float64, Float64]:
+    """The mean weight of each pair's points that have a wall, and their number, at relative poses of shape (m, 3).
 
-    Normals are unit vectors, so that it is the trace of the information of the position.
+    Outliers cannot raise the mean, and scans that see less of the same walls do not lower it. Both are zero where a
+    pair does not overlap. Normals are unit vectors, so that the trace of the information of the position is the sum of
+    the weights.
     """
     first, second = pairs.rows.T
     weighting = weighting_from_options(options)
-    information, _, _ = normal_equations(surfaces, first, surfaces, second, relative, gate, weighting, stride)
-    return np.asarray(information[:, 0, 0] + information[:, 1, 1])
+    information, _, share = normal_equations(surfaces, first, surfaces, second, relative, gate, weighting, stride)
+    total = (information[:, 0, 0] + information[:, 1, 1]) * options.sigma**2 / options.temper
+    count = np.where(share >= pairs.min_share, share * np.diff(surfaces.starts)[first], 0.0)
+    return np.where(count > 0.0, total / np.maximum(count, 1.0), 0.0), count
 
 
 def relative_beliefs(
@@ -349,7 +360,9 @@ def _register_pairs(
     if limits is not None:
         offset = se2.log(se2.between(limits.relative, measured))
         counts &= np.einsum("mi,mij,mj->m", offset, limits.information, offset) <= _GATE
-        before, after = (_agreement(surfaces, pairs, at, gate, stride, options) for at in (limits.relative, measured))
+        (before, _), (after, _) = (
+            _mean_weights(surfaces, pairs, at, gate, stride, options) for at in (limits.relative, measured)
+        )
         counts &= after >= before
     return Edges(
         second[counts], first[counts], measured[counts], _invert(information[counts] + _NEGLIGIBLE_INFORMATION)

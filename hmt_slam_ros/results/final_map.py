@@ -22,6 +22,7 @@ from hmt_slam_ros.loop_closure.closure_refinement import arc_edges, stack_edges
 from hmt_slam_ros.loop_closure.joint_refinement import (
     ScanPairs,
     add_distant_pairs,
+    agree_better,
     certain_areas,
     concatenate_edges,
     linked_areas,
@@ -29,7 +30,6 @@ from hmt_slam_ros.loop_closure.joint_refinement import (
     pair_limits,
     refine_jointly,
     scan_pairs,
-    total_agreement,
 )
 from hmt_slam_ros.messages.messages import Notice
 from hmt_slam_ros.registration.scan_to_scan import (
@@ -184,7 +184,7 @@ class _TrajectoryRefinement:
         """The recording with its nodes at the poses of the joint refinement; the first one is fixed.
 
         A registration counts where the arcs allow it and its two scans agree better than before. The result counts
-        where all scans together agree better.
+        where all pairs together do.
         """
         hybrid_map, nodes, poses = recording.hybrid_map, self.nodes, self.nodes.poses
         pairs = self._pairs(hybrid_map)
@@ -197,8 +197,7 @@ class _TrajectoryRefinement:
         refined = refine_jointly(
             self._surfaces, poses, pairs, edges, self._options, limits=limits, odometry=motion.odometry
         )
-        before, after = (total_agreement(self._surfaces, at, pairs, self._options) for at in (poses, refined))
-        refined = refined if after > before else poses
+        refined = refined if agree_better(self._surfaces, poses, refined, pairs, self._options) else poses
         keyframes = dict(zip(nodes.keyframes[of_keyframe].tolist(), refined[of_keyframe], strict=True))
         return replace(_with_keyframe_poses(recording, keyframes), trajectory=follow_nodes(recording, nodes, refined))
 
