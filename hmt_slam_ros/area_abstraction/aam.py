@@ -40,6 +40,7 @@ from hmt_slam_ros.messages.messages import (
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.relative_motion import is_wide
+from hmt_slam_ros.submap.local_mapping import exceeds_basin
 
 _NEAREST_KEYFRAMES = 8
 """Keyframes of an area, the nearest to a scan, whose overlap with it is measured."""
@@ -224,7 +225,7 @@ class Aam:
             into, area = pair = min(self._state.merge_queue)
             self._state = replace(self._state, merge_queue=self._state.merge_queue - {pair})
             arc = hybrid_map.arc_value(into, area)
-            if arc is None or not arc.closure:
+            if arc is None or not arc.closure or exceeds_basin(arc.pose.covariance):
                 continue
             joined = self._joined_graph(hypothesis, pair, arc.pose.mean)
             value = joined.min_ncut

@@ -329,7 +329,7 @@ class ScanMatcher:
         predicted = _predict_pose(before, step)
         prior, covariance = _map_prior(predicted), predicted.covariance
         match = self._refine(points, self.static_points(points, prior, covariance, view), prior.mean, prior, step, view)
-        if not _exceeds_basin(covariance) and self._fits_map(points, match.pose, view):
+        if not exceeds_basin(covariance) and self._fits_map(points, match.pose, view):
             return [match]
         lattice = self._search_lattice(predicted)
         starts = scan_to_map.correlative_search(
@@ -396,7 +396,7 @@ class ScanMatcher:
 
     def static_points(self, points: Float64, prior: scan_to_map.Prior, covariance: Float64, view: GridView) -> Float64:
         """The points on static objects; all where the covariance of the prior is too wide to decide."""
-        if _exceeds_basin(covariance):
+        if exceeds_basin(covariance):
             return points
         return reject_dynamic(points, prior.mean, prior, view, self._mapping.alignment)
 
@@ -452,7 +452,7 @@ def coincide(pose: Float64, other: Float64) -> bool:
     return math.hypot(x, y) <= _MAX_DISTANCE and abs(turn) <= _MAX_ANGLE
 
 
-def _exceeds_basin(covariance: Float64) -> bool:
+def exceeds_basin(covariance: Float64) -> bool:
     """Whether a pose of this covariance, in its own frame, may be outside the basin of Gauss-Newton."""
     (xx, xy, _), (_, yy, _), (_, _, turn) = covariance.tolist()
     largest = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
