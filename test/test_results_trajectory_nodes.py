@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_results_final_map import blind, room_recording, room_scan
+from test_results_final_map import blind, room_recording, room_scan, with_arc
 from test_results_output_folder import EVERY, SCANS, STAMPS, TRUTH, make_recorder
 
 from hmt_slam_ros.configuration import Configuration
@@ -117,6 +117,20 @@ def test_a_fault_of_odometry_between_two_keyframes_is_left_to_metric_slam(slip: 
     nodes = select_nodes(recording, configuration)
     assert nodes.is_keyframe.all()
     assert motion_edges(nodes, recording, MOTION).matched.sources.tolist() == ([len(KEYFRAMES) - 2] if by_slam else [])
+
+
+@pytest.mark.parametrize(("sigma", "by_slam"), [(0.05, True), (1.0, False)])
+def test_between_two_areas_their_arc_is_contradicted_or_metric_slam_is(sigma: float, by_slam: bool) -> None:
+    """Area 1 is displaced by 0.9 m since its arc was measured, as a closure moves it where the arc is uncertain."""
+    recorder = make_recorder()
+    recording = replace(recorder.finish(STAMPS), odometry=TRUTH)
+    moved = with_arc(recording, np.array([0.9, 0.0, 0.0]), np.diag([sigma, sigma, 0.02]) ** 2)
+    configuration = replace(
+        recorder.configuration, filter=replace(recorder.configuration.filter, keyframe_distance=3.0)
+    )
+    nodes = select_nodes(moved, configuration)
+    (border,) = np.flatnonzero(np.diff(nodes.areas))
+    assert motion_edges(nodes, moved, MOTION).matched.sources.tolist() == [border] * by_slam
 
 
 def test_scans_follow_the_nodes_around_them() -> None:

@@ -17,7 +17,8 @@ from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import chi_square_gate
+from hmt_slam_ros.geometry.gaussian import chi_square_gate, propagate_covariance
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import Edges, edge_chi2
 from hmt_slam_ros.hybrid_map.shortest_path import map_pieces, uninformative_belief
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses
@@ -127,15 +128,16 @@ class MotionEdges(NamedTuple):
 def motion_edges(nodes: TrajectoryNodes, recording: Recording, motion: MotionParameters) -> MotionEdges:
     """The motion along the trajectory, by odometry.
 
-    The steps of metric SLAM have the corrections of the robot's place as well. They count where odometry had a fault
-    between two keyframes, and between two pieces of the map, whose distance is unknown. The edge from one log to the
-    next is uninformative.
+    The steps of metric SLAM have the corrections of the robot's place as well, and those between two areas what
+    closures moved. They count where odometry had a fault between two keyframes, and between two pieces of the map,
+    whose distance is unknown. The edge from one log to the next is uninformative.
     """
     odometry = recording.odometry[nodes.rows]
     by_slam, by_odometry = (se2.between(poses[:-1], poses[1:]) for poses in (nodes.poses, odometry))
     covariances = _path_covariances(recording.odometry, nodes.rows, motion)
     every = np.ones(len(by_slam), np.bool_)
-    is_fault = edge_chi2(_chain_edges(by_odometry, covariances, every), nodes.poses) > _GATE
+    uncertain = covariances + _arc_covariances(nodes, recording.hybrid_map)
+    is_fault = edge_chi2(_chain_edges(by_odometry, uncertain, every), nodes.poses) > _GATE
     piece_of = {area: number for number, piece in enumerate(map_pieces(recording.hybrid_map)) for area in piece}
     pieces = np.array([piece_of[area] for area in nodes.areas.tolist()])
     matched = (is_fault & nodes.is_keyframe[:-1] & nodes.is_keyframe[1:]) | (np.diff(pieces) != 0)
@@ -149,6 +151,19 @@ def _chain_edges(steps: Float64, covariances: Float64, chosen: Bool) -> Edges:
     """The chosen edges of those from each node to the next."""
     sources = np.flatnonzero(chosen)
     return Edges(sources, sources + 1, steps[chosen], covariances[chosen])
+
+
+def _arc_covariances(nodes: TrajectoryNodes, hybrid_map: HybridMap) -> Float64:
+    """What the arc between their areas leaves open of the pose of each of n nodes but the first in the one before it.
+
+    :returns: shape (n - 1, 3, 3), zero within an area.
+    """
+    covariances = np.zeros((len(nodes.rows) - 1, 3, 3))
+    for row in np.flatnonzero(np.diff(nodes.areas)).tolist():
+        arc = hybrid_map.arc(int(nodes.areas[row]), int(nodes.areas[row + 1]))
+        if arc is not None:
+            covariances[row] = propagate_covariance(arc.covariance, nodes.poses_in_area[row + 1])
+    return covariances
 
 
 def _path_covariances(odometry: Trajectory, rows: Int64, motion: MotionParameters) -> Float64:
