@@ -12,6 +12,7 @@ from hmt_slam_ros.arrays import Bool, Float32, Float64, Int32, Int64
 from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.se2 import transform_point
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.sensors import Scan
 
@@ -118,7 +119,7 @@ def build_area_grid(scans: Sequence[Scan], poses: Float64, model: GridModel) -> 
     columns, rows = np.ceil((largest + reach - origin) / model.cell).astype(np.int64) + 1
     counts = _count_scans((rows, columns), origin, model.cell, lasers, hits, numbers)
     fine = np.full((2 * rows, 2 * columns), np.inf, dtype=np.float32)
-    _lower_distances(fine, origin, 0.5 * model.cell, _fill_gaps(hits, numbers, 0.5 * model.cell), reach)
+    _lower_distances(fine, origin, 0.5 * model.cell, hits, numbers, reach)
     _convert_to_log_ratio(fine, counts.free, model.sigma, model.surface_ratio, model.free_ratio)
     static = hits[_mark_static(hits, counts, origin, model.cell)]
     return AreaGrid(origin, model.cell, _downsample(fine), fine, counts.free, thin_points(static, model.spacing))
@@ -136,25 +137,60 @@ def _empty_grid(cell: float) -> AreaGrid:
 
 def _end_points(scans: Sequence[Scan], poses: Float64, max_range: float) -> tuple[Float64, Float64, Int64]:
     """End points and the position of the laser at each, area frame, (n, 2), and the number of its scan, (n,)."""
-    numbers = np.repeat(np.arange(len(scans)), [len(scan.points) for scan in scans])
     points, origins = (
         np.concatenate([np.zeros((0, 2)), *parts])
         for parts in ([scan.points for scan in scans], [scan.origins for scan in scans])
     )
-    near = np.hypot(*(points - origins).T) <= max_range
-    numbers = numbers[near]
-    return se2.transform(poses[numbers], points[near]), se2.transform(poses[numbers], origins[near]), numbers
+    counts = np.array([len(scan.points) for scan in scans], dtype=np.int64)
+    return _place_points(points, origins, counts, poses, max_range)
+
+
+@njit(cache=True)
+def _place_points(
+    points: Float64, origins: Float64, counts: Int64, poses: Float64, max_range: float
+) -> tuple[Float64, Float64, Int64]:
+    """The points within a range of their origins, both (n, 2), with the scans' poses, in the order of the scans."""
+    placed, lasers, numbers = np.empty_like(points), np.empty_like(points), np.empty(len(points), np.int64)
+    begin, held = 0, 0
+    for scan in range(len(counts)):
+        cos, sin = np.cos(poses[scan, 2]), np.sin(poses[scan, 2])
+        for k in range(begin, begin + counts[scan]):
+            if np.hypot(points[k, 0] - origins[k, 0], points[k, 1] - origins[k, 1]) > max_range:
+                continue
+            for source, target in ((points, placed), (origins, lasers)):
+                target[held] = transform_point(poses[scan, 0], poses[scan, 1], cos, sin, source[k, 0], source[k, 1])
+            numbers[held] = scan
+            held += 1
+        begin += counts[scan]
+    return placed[:held], lasers[:held], numbers[:held]
 
 
 def thin_points(points: Float64, spacing: float) -> Float64:
     """The mean point of every occupied voxel, shape (n, 2), ordered by voxel."""
-    if not len(points):
-        return points
-    column, row = np.floor(points / spacing).astype(np.int64).T
-    row -= row.min()
-    _, inverse, counts = np.unique(column * (row.max() + 1) + row, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(inverse, weights=points[:, axis]) for axis in (0, 1)], axis=1)
-    return sums / counts[:, None]
+    return _mean_points(points, spacing) if len(points) else points
+
+
+@njit(cache=True)
+def _mean_points(points: Float64, spacing: float) -> Float64:
+    """:func:`thin_points` of one point at least."""
+    smallest, largest = _limits(points)
+    first, last = np.floor(smallest / spacing), np.floor(largest / spacing)
+    columns, rows = int(last[0] - first[0]) + 1, int(last[1] - first[1]) + 1
+    sums, counts = np.zeros((columns, rows, 2)), np.zeros((columns, rows), np.int64)
+    occupied = 0
+    for n in range(points.shape[0]):
+        column = int(np.floor(points[n, 0] / spacing) - first[0])
+        row = int(np.floor(points[n, 1] / spacing) - first[1])
+        occupied += counts[column, row] == 0
+        counts[column, row] += 1
+        sums[column, row] += points[n]
+    means, held = np.empty((occupied, 2)), 0
+    for column in range(columns):
+        for row in range(rows):
+            if counts[column, row] > 0:
+                means[held] = sums[column, row] / counts[column, row]
+                held += 1
+    return means
 
 
 @njit(cache=True)
@@ -166,28 +202,6 @@ def _limits(points: Float64) -> tuple[Float64, Float64]:
             smallest[axis] = min(smallest[axis], points[n, axis])
             largest[axis] = max(largest[axis], points[n, axis])
     return smallest, largest
-
-
-@njit(cache=True)
-def _fill_gaps(points: Float64, scans: Int64, step: float) -> Float64:
-    """Float64 in the order of the beams, with the gaps along the surfaces of each scan filled.
-
-    :param scans: number of the scan of each point, shape (n,).
-    """
-    counts = np.ones(points.shape[0], np.int64)
-    for k in range(points.shape[0] - 1):
-        length = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
-        if scans[k] == scans[k + 1] and length <= _MAX_GAP:
-            counts[k] = int(np.ceil(length / step))
-    filled = np.empty((counts.sum(), 2))
-    place = 0
-    for k in range(points.shape[0]):
-        for i in range(counts[k]):
-            filled[place] = points[k]
-            if i > 0:
-                filled[place] += (points[k + 1] - points[k]) * (i / counts[k])
-            place += 1
-    return filled
 
 
 @njit(cache=True)
@@ -282,26 +296,55 @@ def _mark_static(points: Float64, counts: _ScanCounts, origin: Float64, cell: fl
 
 
 @njit(cache=True)
-def _lower_distances(distance2: Float32, origin: Float64, cell: float, points: Float64, reach: float) -> None:
-    """Lower every cell near a point to the squared distance from its center to that point, m^2."""
+def _lower_distances(
+    distance2: Float32, origin: Float64, cell: float, points: Float64, scans: Int64, reach: float
+) -> None:
+    """Lower every cell near a surface to the squared distance from its center to it, m^2.
+
+    The gaps along the surfaces of each scan are filled. Of points within a sixteenth of a cell the first counts: in a
+    room that many scans show, most are.
+
+    :param points: shape (n, 2), m, in the order of the beams of each scan.
+    :param scans: number of the scan of each point, shape (n,).
+    """
+    is_lowered = np.zeros(distance2.shape, np.uint16)
+    for k in range(points.shape[0]):
+        count = 1
+        if k + 1 < points.shape[0] and scans[k] == scans[k + 1]:
+            length = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
+            count = int(np.ceil(length / cell)) if length <= _MAX_GAP else 1
+        for i in range(max(1, count)):
+            x, y = points[k, 0], points[k, 1]
+            if i > 0:
+                x += (points[k + 1, 0] - x) * (i / count)
+                y += (points[k + 1, 1] - y) * (i / count)
+            x, y = (x - origin[0]) / cell, (y - origin[1]) / cell
+            column, row = int(x), int(y)
+            part = np.uint16(1 << (4 * int(4.0 * (y - row)) + int(4.0 * (x - column))))
+            if not is_lowered[row, column] & part:
+                is_lowered[row, column] |= part
+                _lower_around(distance2, x - 0.5, y - 0.5, cell, reach)
+
+
+@njit(cache=True)
+def _lower_around(distance2: Float32, x: float, y: float, cell: float, reach: float) -> None:
+    """Lower the cells around a point, whose coordinates are in cells from the center of cell (0, 0)."""
     span = int(np.ceil(reach / cell))
     rows, columns = distance2.shape
     area, squares = np.float32(cell * cell), np.empty(2 * span + 1, np.float32)
-    for k in range(points.shape[0]):
-        x, y = (points[k, 0] - origin[0]) / cell - 0.5, (points[k, 1] - origin[1]) / cell - 0.5
-        column, row = round(x), round(y)
-        first, last = max(0, column - span), min(columns, column + span + 1)
-        left = np.float32(x - first)
+    column, row = round(x), round(y)
+    first, last = max(0, column - span), min(columns, column + span + 1)
+    left = np.float32(x - first)
+    for c in range(last - first):
+        squares[c] = (np.float32(c) - left) * (np.float32(c) - left)
+    for r in range(max(0, row - span), min(rows, row + span + 1)):
+        up = np.float32((r - y) ** 2)
+        # A slice, and a choice instead of a branch, so that the compiler vectorizes. The added 0 prevents a masked
+        # store, which is ten times slower on AMD's processors.
+        part = distance2[r, first:last]
         for c in range(last - first):
-            squares[c] = (np.float32(c) - left) * (np.float32(c) - left)
-        for r in range(max(0, row - span), min(rows, row + span + 1)):
-            up = np.float32((r - y) ** 2)
-            # A slice, and a choice instead of a branch, so that the compiler vectorizes. The added 0 prevents a masked
-            # store, which is ten times slower on AMD's processors.
-            part = distance2[r, first:last]
-            for c in range(last - first):
-                d2 = (squares[c] + up) * area
-                part[c] = (d2 if d2 < part[c] else part[c]) + np.float32(0.0)
+            d2 = (squares[c] + up) * area
+            part[c] = (d2 if d2 < part[c] else part[c]) + np.float32(0.0)
 
 
 @njit(cache=True)
