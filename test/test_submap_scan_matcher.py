@@ -74,7 +74,7 @@ def test_after_a_slip_the_particles_spread_in_heading_alone(mapping):
     area_filter = map_walls(mapping, CORRIDOR, [(x, 0, 0) for x in range(-6, 7)])
     truth = np.array([0.3, 0.0, 0.0])
     track(area_filter, CORRIDOR, truth, RelativeMotion(np.array([0.3, 0.0, np.radians(30.0)]), SURE))
-    spread = np.sqrt(np.diag(area_filter._modes[0].motion_since_update.covariance))
+    spread = np.sqrt(np.diag(area_filter._modes.tracked[0].motion_since_update.covariance))
     assert 20.0 < np.degrees(spread[2]) < 31.0
     assert spread[:2].max() < 0.2
     np.testing.assert_allclose(area_filter.pose, truth, atol=0.05)
@@ -103,7 +103,7 @@ def test_a_scan_that_shows_nothing_of_the_map_is_placed_by_odometry(mapping):
     np.testing.assert_allclose(tracked.information, 0.0, atol=1e-9)
     assert not tracked.contradicts_odometry
     # Nothing proves odometry: with a probability of 1 % it is wrong.
-    wider = np.diag(area_filter._modes[0].motion_since_update.covariance - SURE)
+    wider = np.diag(area_filter._modes.tracked[0].motion_since_update.covariance - SURE)
     assert (wider[:2] >= 0.01 * np.diag(VAGUE)[:2]).all()
 
 
@@ -157,14 +157,14 @@ def test_what_the_scans_leave_open_is_extrapolated_until_the_next_keyframe(mappi
     for k in range(1, 9):
         truth = np.array([0.1 * k, 0.0, 0.0])
         track(area_filter, CORRIDOR, truth, RelativeMotion(np.array([0.1, 0.0, 0.0]), SURE))
-        deviations = np.sqrt(np.diag(area_filter._modes[0].residual_covariance))
+        deviations = np.sqrt(np.diag(area_filter._modes.tracked[0].residual_covariance))
         along.append(deviations[0])
         assert deviations[1] < 0.02
         assert deviations[2] < 0.01
     assert (np.diff(along) > 0).all()
     assert along[-1] == pytest.approx(np.sqrt(8) * 0.02, rel=0.2)
     area_filter.update(PreparedScan(mapping, scan_in(CORRIDOR, truth)), 1)
-    np.testing.assert_array_equal(area_filter._modes[0].residual_covariance, 0.0)
+    np.testing.assert_array_equal(area_filter._modes.tracked[0].residual_covariance, 0.0)
 
 
 @pytest.mark.parametrize("beams", [81, 91, 101])

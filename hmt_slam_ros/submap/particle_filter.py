@@ -27,7 +27,7 @@ from hmt_slam_ros.registration.match_covariance import MatchError, estimate_matc
 from hmt_slam_ros.registration.scan_to_map import Prior
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import Prediction
-from hmt_slam_ros.sensors.relative_motion import NO_MOTION, is_wide
+from hmt_slam_ros.sensors.relative_motion import is_wide
 from hmt_slam_ros.submap.local_filter import (
     FilterStep,
     LineFilterState,
@@ -47,6 +47,8 @@ from hmt_slam_ros.submap.local_mapping import (
     map_information,
 )
 from hmt_slam_ros.submap.pose_modes import (
+    UNMOVED,
+    PoseModes,
     allocate_particles,
     blur_information,
     draw_systematically,
@@ -58,9 +60,6 @@ from hmt_slam_ros.submap.pose_modes import (
 
 _LEAD_MARGIN = 3.0
 """Log-likelihood ratio from which another particle leads, nats: docs/decisions/0006-pose-between-keyframes.md."""
-
-_UNMOVED = TrackedMode(NO_MOTION, NO_MOTION.covariance)
-"""A mode after a filter step."""
 
 
 class _TrackedGroup(NamedTuple):
@@ -109,8 +108,7 @@ class ParticleFilter:
         self._tables = np.stack([mapping.pool.empty_table()] * count)
         self._predicted_poses = self.poses.copy()
         self._last_poses = self.poses.copy()
-        self._modes: tuple[TrackedMode, ...] = (_UNMOVED,)
-        self._members = np.zeros(count, dtype=np.int64)
+        self._modes = PoseModes.single(count)
         self.leader = 0
         self._matcher = ScanMatcher(mapping)
         self._least_share = mapping.configuration.motion.fault_probability
@@ -125,7 +123,7 @@ class ParticleFilter:
         own.keyframes, own.keyframe_areas = list(state.keyframes), list(state.keyframe_areas)
         own.keyframe_poses, own._tables = state.keyframe_poses, state.tables
         own._predicted_poses, own._last_poses = state.predicted_poses, state.last_poses
-        own._modes, own._members = state.modes, state.members
+        own._modes = PoseModes(state.modes, state.members)
         own.leader, own.tracking_covariance = state.leader, state.tracking_covariance
         own.clutter_estimate = state.clutter_estimate
         return own
@@ -144,8 +142,8 @@ class ParticleFilter:
             self._tables,
             self._predicted_poses,
             self._last_poses,
-            self._modes,
-            self._members,
+            self._modes.tracked,
+            self._modes.members,
             self.leader,
             self.tracking_covariance,
             self.clutter_estimate,
@@ -179,17 +177,18 @@ class ParticleFilter:
         self.poses, self._predicted_poses = self.poses.copy(), self._predicted_poses.copy()
         self.log_weights = self.log_weights.copy()
         groups = list[_TrackedGroup]()
-        for number in range(len(self._modes)):
-            most = MOST_MODES - len(groups) - (len(self._modes) - 1 - number)
+        for number in range(self._modes.count):
+            most = MOST_MODES - len(groups) - (self._modes.count - 1 - number)
             groups += self._track_mode(number, prepared.surfels, prediction, most)
-        self._set_modes([group.rows for group in groups], [group.mode for group in groups])
-        lead = groups[self._members[self.leader]]
+        rows, tracked = [group.rows for group in groups], [group.mode for group in groups]
+        self._modes = PoseModes.from_rows(rows, tracked, len(self.poses))
+        lead = groups[self._modes.number(self.leader)]
         covariances = [self._tracking_covariance(group) for group in groups]
         information = self._matcher.information(lead.match)
         self.tracking_covariance = covariances[0]
         if len(groups) > 1:
             self.log_weights -= self.log_weights.max()
-            heads, shares = self._heads(), self._mode_shares()
+            heads, shares = self._heads(), self._modes.shares(self.log_weights)
             motions = se2.between(self._last_poses[heads], self.poses[heads])
             motion = se2.between(self._last_poses[self.leader], self.pose)
             self.tracking_covariance = mix_covariances(motion, motions, covariances, shares)
@@ -203,7 +202,7 @@ class ParticleFilter:
         :param points: surfels of the scan, shape (n, 4), base frame.
         :param most: modes of the match at most.
         """
-        mode, head, rows = self._modes[number], self._head(number), self._rows(number)
+        mode, head, rows = self._modes.tracked[number], self._head(number), self._modes.rows(number)
         before, view = PoseGaussian(self.poses[head].copy(), mode.residual_covariance), self._view(head)
         matches = self._matcher.match(points, before, prediction, view)[: min(most, len(rows))]
         matches[0] = self._check(points, matches[0], head, mode, view)
@@ -250,32 +249,12 @@ class ParticleFilter:
         information = information + match.hessian / self.mapping.alignment.inflation
         return rotate_covariance(matrix_inverse(information), -match.pose[2])
 
-    def _set_modes(self, rows: Sequence[Int64], modes: Sequence[TrackedMode]) -> None:
-        """Set the modes and the particles of each."""
-        members = np.zeros(len(self.poses), dtype=np.int64)
-        for number, own in enumerate(rows):
-            members[own] = number
-        self._modes, self._members = tuple(modes), members
-
-    def _rows(self, number: int) -> Int64:
-        """The particles of a mode."""
-        return np.flatnonzero(self._members == number)
-
     def _head(self, number: int) -> int:
-        """The particle from which a mode is matched: the leader or the heaviest."""
-        if self._members[self.leader] == number:
-            return self.leader
-        rows = self._rows(number)
-        return int(rows[np.argmax(self.log_weights[rows])])
+        return self._modes.head(number, self.leader, self.log_weights)
 
     def _heads(self) -> list[int]:
         """The head of each mode."""
-        return [self._head(number) for number in range(len(self._modes))]
-
-    def _mode_shares(self) -> Float64:
-        """The share of each mode in the weights."""
-        weights = normalize_weights(self.log_weights)
-        return np.asarray(np.bincount(self._members, weights, minlength=len(self._modes)), dtype=np.float64)
+        return [self._head(number) for number in range(self._modes.count)]
 
     def _view(self, particle: int) -> GridView:
         return self.mapping.pool.view(self._tables[particle])
@@ -285,12 +264,12 @@ class ParticleFilter:
 
     def update(self, prepared: PreparedScan, step: int) -> FilterStep:
         """Draw every particle from its optimal proposal, weight it, and resample where the ESS is low."""
-        if len(self._modes) > 1:
-            counted = np.array([mode.counted_evidence for mode in self._modes])
-            self.log_weights = self.log_weights - counted[self._members]
+        if self._modes.count > 1:
+            counted = np.array([mode.counted_evidence for mode in self._modes.tracked])
+            self.log_weights = self.log_weights - counted[self._modes.members]
             self._join_coinciding()
         settings = self.mapping.configuration
-        groups = [self._propose(number, prepared.surfels) for number in range(len(self._modes))]
+        groups = [self._propose(number, prepared.surfels) for number in range(self._modes.count)]
         proposed, evidences = np.empty((len(self.poses), 3)), np.empty(len(self.poses))
         noise = random_stream(settings.seed, Purpose.PARTICLES, step).standard_normal(proposed.shape)
         for group in groups:
@@ -319,8 +298,8 @@ class ParticleFilter:
 
         :param points: surfels of the scan, shape (n, 4), base frame.
         """
-        settings, mode, head = self.mapping.configuration, self._modes[number], self._head(number)
-        rows, covariance, view = self._rows(number), mode.motion_since_update.covariance, self._view(head)
+        settings, mode, head = self.mapping.configuration, self._modes.tracked[number], self._head(number)
+        rows, covariance, view = self._modes.rows(number), mode.motion_since_update.covariance, self._view(head)
         if not mode.shows_map and is_wide(covariance, settings.filter):
             # A match from here would end in some minimum, with a covariance that leaves the truth out.
             points = points[:0]
@@ -343,14 +322,14 @@ class ParticleFilter:
 
     def _assess(self, groups: Sequence[_GroupProposals], heads: Sequence[int]) -> tuple[MatchError, Float64]:
         """The error of the leader's motion, and the information (3, 3) of its match, in the light of all modes."""
-        number = int(self._members[self.leader])
+        number = self._modes.number(self.leader)
         errors = [self._match_error(group, head) for group, head in zip(groups, heads, strict=True)]
         hessian = _hessian(groups[number], self.leader)
         temper = self.mapping.configuration.matching.temper
         information = rotate_covariance(temper * hessian, -self.pose[2])
         if len(groups) == 1:
             return errors[0], information
-        shares, motions = self._mode_shares(), se2.between(self._last_poses[heads], self.poses[heads])
+        shares, motions = self._modes.shares(self.log_weights), se2.between(self._last_poses[heads], self.poses[heads])
         motion = motions[number]
         error = MatchError(
             mix_covariances(motion, motions, [error.pose_covariance for error in errors], shares),
@@ -372,22 +351,22 @@ class ParticleFilter:
 
     def _join_coinciding(self) -> None:
         """Join modes whose heads are in one basin; of two, the one with the leader or the heavier one remains."""
-        shares = self._mode_shares()
-        own = int(self._members[self.leader])
-        order = sorted(range(len(self._modes)), key=lambda number: (number != own, -shares[number]))
-        kept = list[int]()
+        shares, members = self._modes.shares(self.log_weights), self._modes.members
+        own = self._modes.number(self.leader)
+        order = sorted(range(self._modes.count), key=lambda number: (number != own, -shares[number]))
+        heads, kept = self._heads(), list[int]()
         for number in order:
-            pose = self.poses[self._head(number)]
-            into = next((other for other in kept if coincide(pose, self.poses[self._head(other)])), None)
+            pose = self.poses[heads[number]]
+            into = next((other for other in kept if coincide(pose, self.poses[heads[other]])), None)
             if into is None:
                 kept.append(number)
             else:
-                self._members = np.where(self._members == number, into, self._members)
-        self._set_modes([self._rows(number) for number in kept], [self._modes[number] for number in kept])
+                members = np.where(members == number, into, members)
+        self._modes = self._modes.select(kept, members)
 
     def _has_refuted_mode(self) -> bool:
         """Whether a mode is less probable than an odometry fault."""
-        return len(self._modes) > 1 and bool(self._mode_shares().min() < self._least_share)
+        return self._modes.count > 1 and bool(self._modes.shares(self.log_weights).min() < self._least_share)
 
     def compare_scan(self, prepared: PreparedScan) -> MapAgreement:
         """Agreement of a scan with the leader's map, at its pose."""
@@ -400,12 +379,12 @@ class ParticleFilter:
 
         Along a corridor all particles fit alike, and the pose would jump from one to the other.
         """
-        log_shares = np.array([log_sum(self.log_weights[self._rows(number)]) for number in range(len(self._modes))])
-        number, own = int(np.argmax(log_shares)), int(self._members[self.leader])
+        rows = [self._modes.rows(number) for number in range(self._modes.count)]
+        log_shares = np.array([log_sum(self.log_weights[own]) for own in rows])
+        number, own = int(np.argmax(log_shares)), self._modes.number(self.leader)
         if log_shares[number] - log_shares[own] > _LEAD_MARGIN:
             return self._head(number)
-        rows = self._rows(own)
-        heaviest = int(rows[np.argmax(self.log_weights[rows])])
+        heaviest = int(rows[own][np.argmax(self.log_weights[rows[own]])])
         lead = self.log_weights[heaviest] - self.log_weights[self.leader]
         return heaviest if lead > _LEAD_MARGIN else self.leader
 
@@ -413,7 +392,7 @@ class ParticleFilter:
         """Predict from the current poses."""
         self._predicted_poses = self.poses.copy()
         self._last_poses = self.poses.copy()
-        self._modes = (_UNMOVED,) * len(self._modes)
+        self._modes = self._modes.after_filter_step()
 
     def initialize(self, pose: PoseGaussian) -> None:
         """Set all particles to the mean of ``map_T_base``, with its covariance as the residual one."""
@@ -421,14 +400,14 @@ class ParticleFilter:
         self.log_weights = np.zeros(len(self.poses))
         self.tracking_covariance = np.zeros((3, 3))
         self._restart_prediction()
-        self._set_modes([np.arange(len(self.poses))], [replace(_UNMOVED, residual_covariance=pose.covariance)])
+        self._modes = PoseModes.single(len(self.poses), replace(UNMOVED, residual_covariance=pose.covariance))
 
     def _resample(self, step: int) -> None:
         """Systematic resampling within each mode; the leader is kept, and is the first particle afterwards.
 
         Modes that are refuted end. The others have particles by their shares, one at least, and weights for the rest.
         """
-        shares, own = self._mode_shares(), int(self._members[self.leader])
+        shares, own = self._modes.shares(self.log_weights), self._modes.number(self.leader)
         kept = [number for number in range(len(shares)) if shares[number] >= self._least_share or number == own]
         kept.sort(key=lambda number: number != own)
         shares = shares[kept] / shares[kept].sum()
@@ -443,14 +422,14 @@ class ParticleFilter:
         self.log_weights = np.repeat(np.log(shares / counts), counts)
         self.log_weights -= self.log_weights.max()
         rows = np.split(np.arange(len(ancestors)), np.cumsum(counts)[:-1])
-        self._set_modes(rows, [self._modes[number] for number in kept])
+        self._modes = PoseModes.from_rows(rows, [self._modes.tracked[number] for number in kept], len(ancestors))
         self.leader = 0
 
     def _draw(self, number: int, count: int, offset: float) -> Int64:
         """``count`` particles of a mode by their weights, ascending; the leader is among them, and first."""
-        rows = self._rows(number)
+        rows = self._modes.rows(number)
         drawn = rows[draw_systematically(normalize_weights(self.log_weights[rows]), count, offset)]
-        if self._members[self.leader] != number:
+        if self._modes.number(self.leader) != number:
             return drawn
         if self.leader not in drawn:
             drawn[0] = self.leader
@@ -499,13 +478,12 @@ class ParticleFilter:
             if all(coincide(pose, leading) for pose, leading in pairs):
                 kept.append(number)
             else:
-                sources[self._rows(number)] = self.leader
-        if len(kept) == len(self._modes):
+                sources[self._modes.rows(number)] = self.leader
+        if len(kept) == self._modes.count:
             return
-        self._members = self._members[sources]
+        self._modes = self._modes.select(kept, self._modes.members[sources])
         self.poses, self.keyframe_poses = self.poses[sources], self.keyframe_poses[sources]
         self._predicted_poses, self._last_poses = self._predicted_poses[sources], self._last_poses[sources]
-        self._set_modes([self._rows(number) for number in kept], [self._modes[number] for number in kept])
 
     def _load_submap(self, content: Sequence[PlacedKeyframe]) -> None:
         self.release()
