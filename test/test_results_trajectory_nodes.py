@@ -119,6 +119,24 @@ def test_a_fault_of_odometry_between_two_keyframes_is_left_to_metric_slam(slip: 
     assert motion_edges(nodes, recording, MOTION).matched.sources.tolist() == ([len(KEYFRAMES) - 2] if by_slam else [])
 
 
+@pytest.mark.parametrize(("correction", "jump"), [(0.6, 0.0), (0.0, 20.0)])
+def test_a_jump_of_odometry_on_a_pass_is_left_to_metric_slam(correction: float, jump: float) -> None:
+    """A correction of the place contradicts odometry as well, but there the robot moves on as before."""
+    recorder = make_recorder()
+    odometry = TRUTH.copy()
+    odometry[PASS[2] :, 1] += jump
+    recording = replace(recording_of(recorder.finish(STAMPS), correction), odometry=odometry)
+    configuration = replace(
+        recorder.configuration, filter=replace(recorder.configuration.filter, keyframe_distance=0.5)
+    )
+    nodes = select_nodes(recording, configuration)
+    matched = motion_edges(nodes, recording, MOTION).matched
+    across = np.flatnonzero((nodes.rows[:-1] < PASS[2]) & (nodes.rows[1:] >= PASS[2]))
+    assert not nodes.is_keyframe[across[0] : across[0] + 2].all()
+    assert matched.sources.tolist() == (across.tolist() if jump else [])
+    assert np.sqrt(matched.covariances[:, 0, 0]).max(initial=0.0) < 0.3
+
+
 @pytest.mark.parametrize(("sigma", "by_slam"), [(0.05, True), (1.0, False)])
 def test_between_two_areas_their_arc_is_contradicted_or_metric_slam_is(sigma: float, by_slam: bool) -> None:
     """Area 1 is displaced by 0.9 m since its arc was measured, as a closure moves it where the arc is uncertain."""

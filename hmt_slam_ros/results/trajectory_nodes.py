@@ -17,17 +17,21 @@ from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import chi_square_gate, propagate_covariance
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, matrix_inverse, propagate_covariance
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import Edges, edge_chi2
 from hmt_slam_ros.hybrid_map.shortest_path import map_pieces, uninformative_belief
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses
 from hmt_slam_ros.results.trajectories import Trajectory
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.relative_motion import path_covariance
+from hmt_slam_ros.sensors.motion_model import Inertia
+from hmt_slam_ros.sensors.relative_motion import increment_covariance, path_covariance
 
 _GATE = chi_square_gate(0.999)
-"""Squared Mahalanobis distance of a step of metric SLAM beyond which odometry had a fault."""
+"""Squared Mahalanobis distance beyond which a step of metric SLAM, or the robot's velocity, contradicts odometry."""
+
+_RUN_UP = 10
+"""Scans before a motion from which the robot's velocity is learnt."""
 
 
 class TrajectoryNodes(NamedTuple):
@@ -129,8 +133,8 @@ def motion_edges(nodes: TrajectoryNodes, recording: Recording, motion: MotionPar
     """The motion along the trajectory, by odometry.
 
     The steps of metric SLAM have the corrections of the robot's place as well, and those between two areas what
-    closures moved. They count where odometry had a fault between two keyframes, and between two pieces of the map,
-    whose distance is unknown. The edge from one log to the next is uninformative.
+    closures moved. They count where odometry had a fault between two keyframes or jumped, and between two pieces of the
+    map, whose distance is unknown. The edge from one log to the next is uninformative.
     """
     odometry = recording.odometry[nodes.rows]
     by_slam, by_odometry = (se2.between(poses[:-1], poses[1:]) for poses in (nodes.poses, odometry))
@@ -138,13 +142,36 @@ def motion_edges(nodes: TrajectoryNodes, recording: Recording, motion: MotionPar
     every = np.ones(len(by_slam), np.bool_)
     uncertain = covariances + _arc_covariances(nodes, recording.hybrid_map)
     is_fault = edge_chi2(_chain_edges(by_odometry, uncertain, every), nodes.poses) > _GATE
+    is_fault[is_fault] = [
+        (nodes.is_keyframe[edge] and nodes.is_keyframe[edge + 1])
+        or _jumps(recording, nodes.rows[edge], nodes.rows[edge + 1], motion)
+        for edge in np.flatnonzero(is_fault).tolist()
+    ]
     piece_of = {area: number for number, piece in enumerate(map_pieces(recording.hybrid_map)) for area in piece}
     pieces = np.array([piece_of[area] for area in nodes.areas.tolist()])
-    matched = (is_fault & nodes.is_keyframe[:-1] & nodes.is_keyframe[1:]) | (np.diff(pieces) != 0)
+    matched = is_fault | (np.diff(pieces) != 0)
+    covariances[matched] = _path_covariances(recording.trajectory, nodes.rows, motion)[matched]
     logs = np.searchsorted(recording.first_scans, nodes.rows, side="right")
     for edge in np.flatnonzero(np.diff(logs)).tolist():
         matched[edge], covariances[edge] = True, uninformative_belief(by_slam[edge]).covariance
     return MotionEdges(_chain_edges(by_slam, covariances, matched), _chain_edges(by_odometry, covariances, ~matched))
+
+
+def _jumps(recording: Recording, first: int, last: int, motion: MotionParameters) -> bool:
+    """Whether odometry moved between two scans of a log as the robot can hardly have, by its velocity before."""
+    inertia, jumps = Inertia(motion), False
+    for row in range(max(recording.first_scans[-1], first - _RUN_UP), last):
+        seconds = 1e-9 * float(recording.stamps[row + 1] - recording.stamps[row])
+        if seconds <= 0.0:
+            continue
+        predicted, step = inertia.predict(seconds), se2.between(recording.odometry[row], recording.odometry[row + 1])
+        covariance = increment_covariance(se2.log(step), motion)
+        expected = PoseGaussian(predicted.increment, predicted.covariance + covariance)
+        if expected.mahalanobis2(PoseGaussian.from_pose(step)) > _GATE:
+            jumps |= row >= first
+            continue
+        inertia.observe(step, matrix_inverse(covariance))
+    return jumps
 
 
 def _chain_edges(steps: Float64, covariances: Float64, chosen: Bool) -> Edges:
