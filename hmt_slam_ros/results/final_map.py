@@ -215,11 +215,10 @@ class _TrajectoryRefinement:
     def registered_trajectory(self, recording: Recording, scans: Iterable[Scan]) -> Trajectory:
         """The trajectory with every scan of the newest log registered with the keyframes around it."""
         nodes, options = self.nodes, self._options
-        own, area_of = nodes.is_keyframe, dict(zip(nodes.keyframes.tolist(), nodes.areas.tolist(), strict=True))
-        poses, by_keyframe = nodes.poses.copy(), keyframe_poses(recording.hybrid_map, recording.area_poses)
+        own, poses = nodes.is_keyframe, nodes.poses.copy()
+        by_keyframe = keyframe_poses(recording.hybrid_map, recording.area_poses)
         poses[own] = [by_keyframe[keyframe] for keyframe in nodes.keyframes[own].tolist()]
-        references = np.maximum(recording.relative_trajectory.keyframes, nodes.keyframes[0]).tolist()
-        areas = np.array([area_of[keyframe] for keyframe in references], dtype=np.int64)
+        areas = recording.relative_trajectory.areas(recording.hybrid_map)
         trajectory, remaining = recording.trajectory.copy(), iter(scans)
         for first in range(recording.first_scans[-1], len(trajectory), _BATCH):
             batch = list(itertools.islice(remaining, _BATCH))
