@@ -191,20 +191,21 @@ class OdometryNoise:
         """A step with the measured noise, from one with the model's covariance."""
         return odometry._replace(covariance=odometry.covariance * self._variance_factors)
 
-    def fuse(self, odometry: RelativeMotion, inertia: RelativeMotion) -> RelativeMotion:
+    def fuse(self, odometry: RelativeMotion, interpolation: Float64, inertia: RelativeMotion) -> RelativeMotion:
         """The step by odometry and inertia together.
 
         Up to twice the noise of the model, errors are also due to lasting causes, such as floors and wrong radii. Noise
-        beyond that is taken for independent from step to step, and inertia reduces it.
+        beyond that, and errors of interpolation, are taken for independent from step to step, and inertia reduces them.
 
         :param odometry: with the model's covariance.
+        :param interpolation: covariance of the error of interpolation, shape (3, 3).
         """
-        if (self.factors <= NOISY_FACTOR).all():
-            return self.scale(odometry)
         limited = np.minimum(self.factors, NOISY_FACTOR)[[0, 0, 1]]
         lasting = odometry.covariance * np.outer(limited, limited)
-        independent = odometry._replace(covariance=odometry.covariance * self._variance_factors - lasting)
-        fused = independent.fuse(inertia)
+        independent = odometry.covariance * self._variance_factors - lasting + interpolation
+        if not independent.any():
+            return odometry._replace(covariance=lasting)
+        fused = odometry._replace(covariance=independent).fuse(inertia)
         return fused._replace(covariance=fused.covariance + lasting)
 
     def learn(self, odometry: RelativeMotion, matched: Float64, information: Float64) -> None:
@@ -328,7 +329,8 @@ class MotionModel:
 
     def predict(self, stamp: int) -> Prediction:
         """The motion from the last scan to the scan at ``stamp``, ns; none at the first scan."""
-        step, last, since = self._odometry_motion(stamp), self._state.stamp, self._state.since_keyframe
+        last_gap, last, since = self._state.interpolation_gap, self._state.stamp, self._state.since_keyframe
+        step = self._odometry_motion(stamp)
         self._state = replace(self._state, stamp=stamp)
         if last is None:
             return Prediction(None, NO_MOTION, NO_MOTION)
@@ -338,14 +340,32 @@ class MotionModel:
         if step is None:
             self._state = replace(self._state, since_keyframe=None, last_motion=None)
             return Prediction(None, inertia, inertia, after_gap)
+        interpolation = self._interpolation_covariance(last_gap, abs(seconds))
         scaled = self.noise.scale(step)
+        odometry = scaled._replace(covariance=scaled.covariance + interpolation)
+        total = step._replace(covariance=step.covariance + interpolation)
         self._state = replace(
-            self._state, since_keyframe=None if since is None else since.compose(step), last_motion=scaled
+            self._state, since_keyframe=None if since is None else since.compose(total), last_motion=odometry
         )
-        return Prediction(scaled, inertia, self.noise.fuse(step, inertia), after_gap)
+        return Prediction(odometry, inertia, self.noise.fuse(step, interpolation, inertia), after_gap)
+
+    def _interpolation_covariance(self, last_gap: float | None, seconds: float) -> Float64:
+        """Covariance (3, 3) of the error that interpolation between readings adds to the motion since the last scan.
+
+        The error of a pose is the acceleration times ``interpolation_gap``. Within one long gap the two errors are
+        alike: the motion is off by the error of its velocity, which is the acceleration times half of the gap at most.
+
+        :param last_gap: ``interpolation_gap`` at the last scan.
+        :param seconds: since then.
+        """
+        gap = self._state.interpolation_gap
+        assert gap is not None
+        assert last_gap is not None
+        independent, common = last_gap**2 + gap**2, 2.0 * max(last_gap, gap) * seconds**2
+        return np.asarray(min(independent, common) * self._squared_accelerations)
 
     def _odometry_motion(self, stamp: int) -> RelativeMotion | None:
-        """The motion from the last scan by odometry, None where that is unknown at either end."""
+        """The motion from the last scan by the readings, None where that is unknown at either end."""
         interpolated = self.odometry.pose_at(stamp)
         if interpolated is None:
             self._state = replace(self._state, interpolation_gap=None)
@@ -355,8 +375,7 @@ class MotionModel:
         if last_gap is None:
             return None
         increment = se2.between(last_pose, pose)
-        covariance = increment_covariance(increment, self._motion)
-        return RelativeMotion(increment, covariance + (last_gap**2 + gap**2) * self._squared_accelerations)
+        return RelativeMotion(increment, increment_covariance(increment, self._motion))
 
     def observe(self, increment: Float64, information: Float64, contradicted: bool = False) -> None:
         """Update the velocity by the motion that was predicted last.

@@ -198,6 +198,13 @@ class ScanMatcher:
         :param points: surfels of the scan, shape (n, 4), base frame.
         :param before: belief over ``map_T_base`` at the last scan.
         """
+        modes = self._find_modes(points, before, prediction, view)
+        return [self._without_inertia(before, prediction, mode) for mode in modes]
+
+    def _find_modes(
+        self, points: Float64, before: PoseGaussian, prediction: Prediction, view: GridView
+    ) -> list[ScanMatch]:
+        """The modes of :meth:`match`, in which inertia counts for scans that show nothing as well."""
         by_odometry = self._match_with_prior(points, before, prediction.fused, view)
         best = self._select_best(points, by_odometry, view)
         if prediction.odometry is None or (
@@ -291,6 +298,14 @@ class ScanMatcher:
         prior = _map_prior(_predict_pose(before, step))
         fused = self._refine(points, points, match.pose, prior, step, view)
         return fused._replace(log_mass=match.log_mass, contradicts_odometry=True)
+
+    @staticmethod
+    def _without_inertia(before: PoseGaussian, prediction: Prediction, match: ScanMatch) -> ScanMatch:
+        """A match without evidence has the covariance of odometry: velocities that no scan shows add nothing to it."""
+        if match.hessian.any() or prediction.odometry is None or match.predicted_motion is not prediction.fused:
+            return match
+        step = prediction.fused._replace(covariance=prediction.odometry.covariance)
+        return match._replace(predicted_motion=step, prior=_map_prior(_predict_pose(before, step)))
 
     def _with_fault(self, match: ScanMatch, inertia: RelativeMotion) -> ScanMatch:
         """A match without evidence for odometry: its covariance is that of both predictions, by their probabilities."""
