@@ -11,8 +11,9 @@ import errno
 import fcntl
 import os
 import re
+import secrets
 import shutil
-import tempfile
+import weakref
 from contextlib import suppress
 from pathlib import Path
 
@@ -155,11 +156,14 @@ class ScratchFolder:
         for entry in folder.iterdir():
             if entry.name.startswith(prefix) and not entry.is_symlink():
                 _remove_abandoned(entry, place)
-        self.path = Path(tempfile.mkdtemp(prefix=f"{prefix}{os.getpid()}-", dir=folder))
+        self.path = folder / f"{prefix}{os.getpid()}-{secrets.token_hex(4)}"
+        # Before it is made, since a signal may end the program between any two lines.
+        self._removal = weakref.finalize(self, _remove_own_scratch, self.path, os.getpid())
+        self.path.mkdir(mode=0o700)
         try:
             self._lock = os.open(self.path / _LOCK, os.O_CREAT | os.O_WRONLY | os.O_CLOEXEC)
         except OSError:
-            shutil.rmtree(self.path, ignore_errors=True)
+            self._removal()
             raise
         with suppress(OSError):  # a file system without locks: the folder is never taken for an abandoned one
             fcntl.flock(self._lock, fcntl.LOCK_EX)
@@ -167,9 +171,15 @@ class ScratchFolder:
             os.write(self._lock, f"{os.getpid()}\n".encode())
 
     def remove(self) -> None:
-        """Remove the folder with all in it."""
-        _remove_scratch(self.path)
+        """Remove the folder with all in it, as happens otherwise when it is not used any more or the program ends."""
+        self._removal()
         os.close(self._lock)
+
+
+def _remove_own_scratch(folder: Path, process: int) -> None:
+    """Remove a scratch folder, but not in a process that was forked from its own."""
+    if os.getpid() == process:
+        _remove_scratch(folder)
 
 
 def _remove_abandoned(folder: Path, place: Path) -> None:

@@ -76,6 +76,32 @@ def test_the_scratch_folder_of_a_killed_process_goes_and_every_other_stays(tmp_p
     assert names(tmp_path) == [".out.partial-backup", ".out.partial-made"]
 
 
+@pytest.mark.parametrize("line", ["self.path.mkdir(", "self._lock = os.open(", "fcntl.flock(", "after"])
+def test_a_program_that_a_signal_ends_between_any_two_lines_leaves_no_scratch_folder(tmp_path, line):
+    ended = """
+        import inspect, sys
+        from pathlib import Path
+        from hmt_slam_ros.own_files import ScratchFolder
+
+        lines, first = inspect.getsourcelines(ScratchFolder.__init__)
+        ends_before = first + 1 + next((k for k, line in enumerate(lines) if sys.argv[2] in line), len(lines))
+
+        def trace(frame, event, _):
+            if frame.f_code is ScratchFolder.__init__.__code__ and event == "line" and frame.f_lineno == ends_before:
+                raise SystemExit(143)
+            return trace
+
+        sys.settrace(trace)
+        scratch = ScratchFolder(Path(sys.argv[1]), Path(sys.argv[1]).parent)
+        sys.settrace(None)
+        raise SystemExit(143)
+    """
+    arguments = [str(tmp_path / "out"), line]
+    run = subprocess.run([sys.executable, "-c", textwrap.dedent(ended), *arguments], check=False)
+    assert run.returncode == 143
+    assert names(tmp_path) == []
+
+
 def test_a_folder_that_cannot_be_moved_in_two_steps_leaves_the_old_one(tmp_path, monkeypatch):
     """A file system that cannot exchange two names, and a disk that fails at the second step."""
     for name in ("book", "new"):
