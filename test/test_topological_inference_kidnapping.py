@@ -2,11 +2,20 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from ring_for_tsbi import RING, Run, ring_drive
 from test_topological_inference_branching import OTHER, PATH, ROOM, rooms_apart
+from test_topological_inference_relocalization_rules import (
+    ARC,
+    OPTIONS,
+    GivenSearch,
+    candidate,
+    distribution,
+    make_parent,
+)
 from worlds import box, scan_in
 
 from hmt_slam_ros.configuration import Configuration
@@ -17,7 +26,7 @@ from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.messages.messages import AreaEvents, Keyframe, PrunedKeyframe
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
-from hmt_slam_ros.topological_inference import relocalization
+from hmt_slam_ros.topological_inference import kidnapping, relocalization
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 from hmt_slam_ros.topological_inference.global_localization import UNMAPPED_PRIOR, PoseDistribution
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
@@ -375,3 +384,57 @@ def test_keyframes_of_a_kidnapped_robot_are_not_pruned_at_the_same_event():
     (answer,) = run.keyframe(poses[14])
     assert [hypothesis.lost for hypothesis in answer.hypotheses] == [False, True]
     assert not answer.pruned_keyframes
+
+
+@pytest.mark.parametrize(
+    ("log_odds", "confirmed", "lost"), [(-0.1, False, False), (2.0, False, True), (2.0, True, False)]
+)
+def test_without_mapping_a_probable_kidnapping_that_no_match_refutes_loses_the_robot(
+    monkeypatch, log_odds, confirmed, lost
+):
+    pose = PoseInArea(5, 30, np.array([1.0, 1.0, 0.3]))
+    priors = KidnappingPriors(OPTIONS.kidnapping_prior, 0.01)
+    evidence = {29: 1.0, 30: log_odds - priors.log_odds("ordinary", {}) - 1.0}
+    parent = make_parent(Tracking())
+    state = replace(parent.state, kidnapping_evidence=evidence, unstored_poses={30: pose})
+    monkeypatch.setattr(kidnapping, "_confirms_tracked_pose", lambda _branching, _parent, _since: confirmed)
+    branching = SimpleNamespace(options=OPTIONS, kidnapping_priors=priors)
+    child = kidnapping.decide_without_mapping(branching, replace(parent, state=state), 30)
+    assert child.state.is_lost is lost
+    if log_odds > 0.0:
+        assert child.state.kidnapping_evidence == child.state.unstored_poses == {}
+    else:
+        assert child.state is state
+    if lost:
+        first = child.state.localization
+        assert first.since == 31
+        assert first.false_alarm.tracked_pose is pose
+        # The oldest event is below a fifth of the evidence.
+        assert first.false_alarm.probability == pytest.approx(1.0 / (1.0 + math.exp(log_odds - 1.0)))
+
+
+def test_scans_that_no_map_holds_are_matched_seen_from_the_first_since_then():
+    parent = make_parent(Tracking(), area=0)
+    poses = {
+        28: PoseInArea(0, 28, np.array([0.5, 0.5, 0.1])),
+        29: PoseInArea(1, 29, np.array([0.2, -0.4, 0.3])),
+        30: PoseInArea(2, 30, np.array([0.2, -0.4, 0.3])),
+        31: PoseInArea(0, 31, np.array([2.5, 1.5, 0.9])),
+    }
+    parent = replace(parent, state=replace(parent.state, unstored_poses=poses))
+    first = se2.compose(ARC, poses[29].pose)
+    branching = GivenSearch(options=OPTIONS, found=distribution((candidate(0, first, 0.7), 0.5)))
+    assert kidnapping._confirms_tracked_pose(branching, parent, 29)
+    requested, before, _ = branching.requested
+    assert (list(requested), before) == ([29, 31], 29)
+    np.testing.assert_allclose(requested[31], se2.between(first, poses[31].pose))
+    branching.found = distribution((candidate(0, first, 0.5), 0.5))
+    assert not kidnapping._confirms_tracked_pose(branching, parent, 29)
+    assert not kidnapping._confirms_tracked_pose(branching, parent, 99)
+
+
+@pytest.mark.parametrize(("event", "expected"), [(22, [22, 23, 24, 25]), (20, [21, 22, 23, 24, 25]), (26, [])])
+def test_an_area_keeps_a_keyframe_when_others_begin_a_new_one(event, expected):
+    assert kidnapping._keyframes_since(make_parent(Tracking()), event) == expected
+    kept = kidnapping._keyframes_since(make_parent(Tracking()), 21)
+    assert kept == [21, 22, 23, 24, 25]
