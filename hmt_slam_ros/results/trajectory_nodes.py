@@ -17,7 +17,7 @@ from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, matrix_inverse, propagate_covariance
+from hmt_slam_ros.geometry.gaussian import chi_square_gate, matrix_inverse, propagate_covariance
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import Edges, edge_chi2
 from hmt_slam_ros.hybrid_map.shortest_path import map_pieces, uninformative_belief
@@ -25,10 +25,10 @@ from hmt_slam_ros.results.recorder import Recording, keyframe_poses
 from hmt_slam_ros.results.trajectories import Trajectory
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import Inertia
-from hmt_slam_ros.sensors.relative_motion import increment_covariance, path_covariance
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion, increment_covariance, is_jump, path_covariance
 
 _GATE = chi_square_gate(0.999)
-"""Squared Mahalanobis distance beyond which a step of metric SLAM, or the robot's velocity, contradicts odometry."""
+"""Squared Mahalanobis distance of a step of metric SLAM beyond which odometry had a fault."""
 
 _RUN_UP = 10
 """Scans before a motion from which the robot's velocity is learnt."""
@@ -165,12 +165,11 @@ def _jumps(recording: Recording, first: int, last: int, motion: MotionParameters
         if seconds <= 0.0:
             continue
         predicted, step = inertia.predict(seconds), se2.between(recording.odometry[row], recording.odometry[row + 1])
-        covariance = increment_covariance(se2.log(step), motion)
-        expected = PoseGaussian(predicted.increment, predicted.covariance + covariance)
-        if expected.mahalanobis2(PoseGaussian.from_pose(step)) > _GATE:
+        covariance = increment_covariance(step, motion)
+        if is_jump(RelativeMotion(step, covariance), predicted):
             jumps |= row >= first
-            continue
-        inertia.observe(step, matrix_inverse(covariance))
+        else:
+            inertia.observe(step, matrix_inverse(covariance))
     return jumps
 
 

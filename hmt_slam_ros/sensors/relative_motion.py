@@ -10,12 +10,18 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.metric_slam import FilterParameters, MotionParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import matrix_inverse, propagate_covariance
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, matrix_inverse, propagate_covariance
 
 _DEGREES, _RADIANS = 180.0 / math.pi, math.pi / 180.0
 
 _ANY_HEADING = math.pi / math.sqrt(3.0)
 """Deviation of a heading of which nothing is known, rad."""
+
+_JUMP_GATE = chi_square_gate(0.999)
+"""Squared Mahalanobis distance up to which odometry agrees with inertia; 3 degrees of freedom."""
+
+_LEAST_VARIANCE = 1e-12
+"""Variance of a motion at least, m^2 and rad^2, so that those without uncertainty compare."""
 
 Length = TypeVar("Length", float, Float64)
 
@@ -85,6 +91,12 @@ def path_standard_deviations(distance: Length, angle: Length, motion: MotionPara
     )
     rotation = (motion.rotation_floor + motion.rotation_from_translation * distance) * _RADIANS
     return translation, rotation + motion.rotation_from_rotation * angle
+
+
+def is_jump(odometry: RelativeMotion, inertia: RelativeMotion) -> bool:
+    """Whether the robot can hardly have moved as odometry says."""
+    expected = PoseGaussian(inertia.increment, inertia.covariance + _LEAST_VARIANCE * np.eye(3))
+    return PoseGaussian(*odometry).mahalanobis2(expected) > _JUMP_GATE
 
 
 def is_wide(covariance: Float64, settings: FilterParameters) -> bool:

@@ -39,7 +39,7 @@ from hmt_slam_ros.registration.dynamic_rejection import reject_dynamic
 from hmt_slam_ros.registration.match_covariance import MatchNoise
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import Prediction
-from hmt_slam_ros.sensors.relative_motion import RelativeMotion
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion, is_jump
 from hmt_slam_ros.sensors.scan import extract_surfels
 
 _ODDS_PER_NAT = 20.0
@@ -64,10 +64,7 @@ _AMBIGUOUS = 3.0
 """Difference of the evidence below which two matches are equally good, nats: decision 0006."""
 
 _GATE = chi_square_gate(0.999)
-"""Squared Mahalanobis distance up to which odometry agrees with a match, or with inertia; 3 degrees of freedom."""
-
-_LEAST_VARIANCE = 1e-12
-"""Variance of a motion at least, m^2 and rad^2, so that those without uncertainty compare."""
+"""Squared Mahalanobis distance up to which odometry agrees with a match; 3 degrees of freedom."""
 
 T = TypeVar("T")
 
@@ -209,7 +206,7 @@ class ScanMatcher:
         best = self._select_best(points, by_odometry, view)
         if prediction.odometry is None or (
             self._agrees_with_prediction(points, best, view)
-            and not (best.hessian.any() and _jumps(prediction.odometry, prediction.inertia))
+            and not (best.hessian.any() and is_jump(prediction.odometry, prediction.inertia))
         ):
             return self._select_modes(points, best, by_odometry, view)
         by_inertia = self._match_with_prior(points, before, prediction.inertia, view)
@@ -444,12 +441,6 @@ class ScanMatcher:
 def _predict_pose(before: PoseGaussian, step: RelativeMotion) -> PoseGaussian:
     covariance = propagate_covariance(before.covariance, step.increment) + step.covariance
     return PoseGaussian(se2.compose(before.mean, step.increment), covariance)
-
-
-def _jumps(odometry: RelativeMotion, inertia: RelativeMotion) -> bool:
-    """Whether the robot can hardly have moved as odometry says."""
-    expected = PoseGaussian(inertia.increment, inertia.covariance + _LEAST_VARIANCE * np.eye(3))
-    return PoseGaussian(*odometry).mahalanobis2(expected) > _GATE
 
 
 def _mahalanobis2(pose: Float64, prior: scan_to_map.Prior) -> float:
