@@ -32,6 +32,7 @@ from hmt_slam_ros.registration.search_bounds import (
     TOO_WIDE,
     WIDTHS,
     LogRatioGrid,
+    SearchMemory,
     SquareRange,
     add_block,
     build_pyramid,
@@ -69,7 +70,7 @@ def test_the_bounds_of_a_lattice_are_those_of_its_squares(shape):
     corners = rng.integers(-60, 60, (300, 2)).astype(np.int32)
     for (across, along), left, low in itertools.product(((1, 1), (5, 2), (2, 6)), (0, 3), (0, 1)):
         classes = rng.integers(0, TOO_WIDE + 1, 300).astype(np.int8)
-        phased, squares = sort_by_phase(level, 8), SquareRange(left, low, across, along)
+        phased, squares = sort_by_phase(level, 8, SearchMemory()), SquareRange(left, low, across, along)
         bounds = lattice_bounds(phased, corners, classes, squares)
         for few in (classes, np.minimum(classes, TOO_WIDE - 1)):
             counts, largest = count_known(phased, corners, few, squares)
@@ -122,7 +123,7 @@ def test_half_of_the_keyframes_have_to_be_near_positions_and_one_near_a_searched
     keyframes = rng.uniform(-1.0, 1.0, (4 + seed % 2, 2))
     window = make_search_window(np.zeros(3), np.diag([0.4, 0.4, 0.4]) ** 2, 0.1, 0.2, 9.0)
     given = constrain_around(known, is_searched, keyframes, 0.4, 0.1)
-    constraint = build_constraint_pyramid(given, window)
+    constraint = build_constraint_pyramid(given, window, SearchMemory())
     allowed, found = np.pad(given.allowed.log_ratio, 99), []
     for k, i, j in rng.integers([0, *window.first], [window.turns.size, *window.last + 1], (200, 3)).tolist():
         admissible = []
@@ -156,7 +157,7 @@ def test_the_lattice_is_the_gate_within_bounds(mean):
 @pytest.mark.parametrize("shape", [(13, 18), (4, 9), (33, 24)])
 def test_a_pyramid_has_the_largest_log_ratios_of_squares_of_tiles_in_steps(shape):
     log_ratio = np.random.default_rng(4).normal(size=shape).astype(np.float32)
-    pyramid = build_pyramid(log_ratio)
+    pyramid = build_pyramid(log_ratio, SearchMemory())
     assert pyramid.step == pytest.approx(log_ratio.max() / 64.0)
     wide = np.pad(log_ratio, 99)
     steps = np.maximum(-128, np.ceil(wide / pyramid.step - 1e-4))
@@ -256,7 +257,7 @@ def test_sums_over_samples_are_those_of_the_cells_where_they_lie(seed):
     surface = LogRatioGrid(rng.normal(size=(20, 28)).astype(np.float32), rng.uniform(-1.5, -0.5, 2), 0.1)
     samples = rng.uniform(-1.0, 1.0, (6, 2))
     window = make_search_window(rng.uniform(-0.5, 0.5, 3), np.diag([0.2, 0.2, 0.1]) ** 2, 0.1, 0.08, 9.0)
-    cells, pyramid = sample_cells(window, surface, samples), build_pyramid(surface.log_ratio)
+    cells, pyramid = sample_cells(window, surface, samples), build_pyramid(surface.log_ratio, SearchMemory())
     groups = group_turns(cells, window.first)
     wide = np.pad(surface.log_ratio, 40)
     for k, i, j in itertools.product(range(window.turns.size), (-6, -1, 4), (-5, 0, 3)):
@@ -287,8 +288,9 @@ def test_of_a_square_the_quarters_are_searched_that_may_hold_a_cell_the_best_fir
     constraint = build_constraint_pyramid(
         constrain_around(rng.uniform(-1.0, 1.0, (3, 2)), np.ones(3, bool), rng.uniform(-1.0, 1.0, (2, 2)), 0.3, 0.1),
         window,
+        SearchMemory(),
     )
-    pyramid, cells = build_pyramid(surface.log_ratio), sample_cells(window, surface, samples)
+    pyramid, cells = build_pyramid(surface.log_ratio, SearchMemory()), sample_cells(window, surface, samples)
     groups = group_turns(cells, window.first)
     problem = _SearchProblem(window, surface, pyramid, cells, groups, constraint, reverse, 0.5, 2.0)
     pushed, last = [], window.turns.size - 1

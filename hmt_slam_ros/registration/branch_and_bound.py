@@ -9,6 +9,7 @@ of the best, not the best alone.
 from __future__ import annotations
 
 import math
+import threading
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +35,7 @@ from hmt_slam_ros.registration.search_bounds import (
     LogRatioGrid,
     PhasedLevel,
     Pyramid,
+    SearchMemory,
     SearchWindow,
     SquareRange,
     TurnGroups,
@@ -199,6 +201,16 @@ class _SearchProblem(NamedTuple):
     margin: float
 
 
+class _ThreadMemory(threading.local):
+    """The memory of the searches of a thread: that of the surface, and that of the constraint."""
+
+    def __init__(self) -> None:
+        self.surface, self.constraint = SearchMemory(), SearchMemory()
+
+
+_memory = _ThreadMemory()
+
+
 def search_cells(
     window: SearchWindow,
     surface: LogRatioGrid,
@@ -225,18 +237,25 @@ def search_cells(
     edge = max(1, int((window.last - window.first).max()))
     height = min(MAX_HEIGHT, max(MIN_HEIGHT, int(np.ceil(np.log2(edge))) - 2))
     sampled = sample_cells(window, surface, samples)
+    bounds = build_pyramid(surface.log_ratio, _memory.surface)
+    admissible = build_constraint_pyramid(constraint or no_constraint(window.cell), window, _memory.constraint)
     task = _SearchProblem(
         window,
         surface,
-        build_pyramid(surface.log_ratio),
+        bounds,
         sampled,
         group_turns(sampled, window.first),
-        build_constraint_pyramid(constraint or no_constraint(window.cell), window),
+        admissible,
         make_reverse_check(window, reverse_grid, reverse_samples),
         temper,
         margin,
     )
-    cells, squares = _search_depth_first(task, height, threshold)
+    across, tile = int((window.last[0] - window.first[0]) // 2**height + 1), height - MIN_HEIGHT
+    coarsest = (
+        sort_by_phase(bounds.levels[tile], across, _memory.surface),
+        sort_by_phase(admissible.pyramid.levels[tile], across, _memory.constraint),
+    )
+    cells, squares = _search_depth_first(task, coarsest, height, threshold)
     cells = cells[cells[:, 3] >= max(threshold, cells[:, 3].max(initial=-np.inf) - margin)]
     lattice = int(np.prod((window.last - window.first) // 2**height + 1)) * _count_groups(task, height)
     work = squares * len(samples) + _CELL_WORK * surface.log_ratio.size
@@ -245,12 +264,16 @@ def search_cells(
 
 
 @njit(cache=True)
-def _search_depth_first(task: _SearchProblem, height: int, threshold: float) -> tuple[Float64, int]:
+def _search_depth_first(
+    task: _SearchProblem, coarsest: tuple[PhasedLevel, PhasedLevel], height: int, threshold: float
+) -> tuple[Float64, int]:
     """Cells (k, i, j, score, contradiction), a superset of the result, and the number of squares that were read.
 
     Depth first, best bound first.
+
+    :param coarsest: the levels for squares of ``height``, of the surface and of the constraint.
     """
-    nodes, coarse, squares = _coarse_nodes(task, height, threshold)
+    nodes, coarse, squares = _coarse_nodes(task, coarsest, height, threshold)
     stack, bounds = np.empty((8 * height, 4), dtype=np.int64), np.empty(8 * height)
     found, count = np.empty((1024, 5)), 0
     points = np.empty_like(task.reverse.points)
@@ -285,15 +308,16 @@ def _count_groups(task: _SearchProblem, height: int) -> int:
 
 
 @njit(cache=True)
-def _coarse_nodes(task: _SearchProblem, height: int, threshold: float) -> tuple[Int64, Float64, int]:
+def _coarse_nodes(
+    task: _SearchProblem, coarsest: tuple[PhasedLevel, PhasedLevel], height: int, threshold: float
+) -> tuple[Int64, Float64, int]:
     """The coarsest nodes (g, i, j) with a bound of ``threshold``, their bounds, and the number of squares read.
 
     Of a lattice that is the rectangle around the squares that the constraint admits.
     """
     tile, groups = height - MIN_HEIGHT, task.groups
+    surface, allowed = coarsest
     across, along = (task.window.last - task.window.first) // 2**height + 1
-    level = sort_by_phase(task.bounds.levels[tile], across)
-    allowed = sort_by_phase(task.constraint.pyramid.levels[tile], across)
     nodes, bounds = np.empty((1024, 3), dtype=np.int64), np.empty(1024)
     admitted = np.empty((across * along, 2), dtype=np.int64)
     count, squares = 0, 0
@@ -304,7 +328,7 @@ def _coarse_nodes(task: _SearchProblem, height: int, threshold: float) -> tuple[
             continue
         a, b = admitted[:size, 0], admitted[:size, 1]
         box = SquareRange(a.min(), b.min(), a.max() - a.min() + 1, b.max() - b.min() + 1)
-        steps = lattice_bounds(level, groups.corners[group], groups.classes[group], box)
+        steps = lattice_bounds(surface, groups.corners[group], groups.classes[group], box)
         squares += box.across * box.along
         if count + size > len(nodes):
             nodes = np.concatenate((nodes, np.empty((len(nodes) + size, 3), np.int64)))

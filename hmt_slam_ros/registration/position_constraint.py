@@ -15,6 +15,7 @@ from hmt_slam_ros.registration.search_bounds import (
     TOP_STEPS,
     LogRatioGrid,
     Pyramid,
+    SearchMemory,
     SearchWindow,
     TurnGroups,
     build_pyramid,
@@ -77,9 +78,11 @@ def no_constraint(cell: float) -> PositionConstraint:
     return PositionConstraint(LogRatioGrid(np.zeros((1, 1), np.float32), np.zeros(2), cell), np.zeros((0, 2)))
 
 
-def build_constraint_pyramid(constraint: PositionConstraint, window: SearchWindow) -> ConstraintPyramid:
-    """A constraint for a search of a window."""
-    pyramid = build_pyramid(constraint.allowed.log_ratio)
+def build_constraint_pyramid(
+    constraint: PositionConstraint, window: SearchWindow, memory: SearchMemory
+) -> ConstraintPyramid:
+    """A constraint for a search of a window, valid until the next of that memory is built."""
+    pyramid = build_pyramid(constraint.allowed.log_ratio, memory)
     cells = sample_cells(window, constraint.allowed, constraint.keyframes)
     return ConstraintPyramid(pyramid, cells, group_turns(cells, window.first))
 

@@ -6,6 +6,7 @@ are read together, sample by sample, which costs hardly more than a single squar
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -126,6 +127,25 @@ PAD = WIDTHS[-1]
 """Tiles of 0 on every side of a level."""
 
 
+class SearchMemory:
+    """Arrays that each search of a thread uses again.
+
+    Those of a search hold some megabytes; new ones each time take longer than what is computed in them.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, Int8] = {}
+
+    def zeros(self, name: str, shape: tuple[int, ...]) -> Int8:
+        """An array of zeros; the last one of that name is invalid."""
+        size = math.prod(shape)
+        array = self._arrays.get(name)
+        if array is None or array.size < size:
+            array = self._arrays[name] = np.empty(size, dtype=np.int8)
+        array[:size] = 0
+        return array[:size].reshape(shape)
+
+
 class Pyramid(NamedTuple):
     """Maxima of log-ratios, in steps.
 
@@ -141,45 +161,48 @@ class Pyramid(NamedTuple):
     step: float
 
 
-def build_pyramid(log_ratio: Float32) -> Pyramid:
-    """The pyramid of a grid."""
+def build_pyramid(log_ratio: Float32, memory: SearchMemory) -> Pyramid:
+    """The pyramid of a grid, in a search's memory: valid until the next of that memory is built."""
     step = max(float(log_ratio.max()), 1e-6) / TOP_STEPS
     # Whole tiles of all heights.
     largest = 2 ** (MAX_HEIGHT - MIN_HEIGHT)
     rows, columns = (-(-size // largest) * largest for size in log_ratio.shape)
-    tiles = np.zeros((rows + 2 * PAD, columns + 2 * PAD), dtype=np.int8)
+    cells = tiles = memory.zeros("cells", (rows + 2 * PAD, columns + 2 * PAD))
     _round_up(log_ratio, 1.0 / step, tiles[PAD:, PAD:])
-    cells, levels = tiles, []
+    levels = []
     for height in range(MIN_HEIGHT, MAX_HEIGHT + 1):
-        levels.append(_widen_all(tiles))
+        two, four = memory.zeros("two tiles", tiles.shape), memory.zeros("four tiles", tiles.shape)
+        levels.append(memory.zeros(f"level {height}", (len(WIDTHS), *tiles.shape)))
+        _widen_all(tiles, two, four, levels[-1])
         if height < MAX_HEIGHT:
-            tiles = _merge_tiles(tiles)
+            rows, columns = rows // 2, columns // 2
+            merged = memory.zeros(f"tiles {height}", (rows + 2 * PAD, columns + 2 * PAD))
+            _merge_tiles(tiles, merged)
+            tiles = merged
     return Pyramid(cells, tuple(levels), step)
 
 
 @njit(cache=True)
-def _merge_tiles(tiles: Int8) -> Int8:
-    """Maxima of two by two tiles, with the same number of tiles around."""
-    rows, columns = (tiles.shape[0] - 2 * PAD) // 2, (tiles.shape[1] - 2 * PAD) // 2
-    merged = np.zeros((rows + 2 * PAD, columns + 2 * PAD), np.int8)
+def _merge_tiles(tiles: Int8, merged: Int8) -> None:
+    """Write maxima of two by two tiles, with the same number of tiles around."""
+    rows, columns = merged.shape[0] - 2 * PAD, merged.shape[1] - 2 * PAD
     for r in range(rows):
         above, below, row = tiles[PAD + 2 * r], tiles[PAD + 2 * r + 1], merged[PAD + r]
         for c in range(columns):
             x = PAD + 2 * c
             row[PAD + c] = max(above[x], above[x + 1], below[x], below[x + 1])
-    return merged
 
 
 @njit(cache=True)
-def _widen_all(tiles: Int8) -> Int8:
-    """Maxima over the squares of all widths that begin at a tile, shape (len(WIDTHS), *tiles.shape)."""
-    two, four = np.zeros_like(tiles), np.zeros_like(tiles)
-    wide = np.zeros((len(WIDTHS), *tiles.shape), np.int8)
+def _widen_all(tiles: Int8, two: Int8, four: Int8, wide: Int8) -> None:
+    """Write to ``wide`` the maxima over the squares of all widths that begin at a tile, (len(WIDTHS), *tiles.shape).
+
+    :param two: buffer, of zeros, as ``four`` and ``wide``.
+    """
     _widen(tiles, two, 1)
     _widen(two, four, 2)
     for c in range(len(WIDTHS)):
         _widen(four, wide[c], WIDTHS[c] - TILES)
-    return wide
 
 
 @njit(cache=True)
@@ -292,18 +315,24 @@ class PhasedLevel(NamedTuple):
     across: int
 
 
-@njit(cache=True)
-def sort_by_phase(level: Int8, across: int) -> PhasedLevel:
-    """A level of a pyramid for a lattice of its squares, of which ``across`` at most are read along x."""
+def sort_by_phase(level: Int8, across: int, memory: SearchMemory) -> PhasedLevel:
+    """A level of a pyramid for a lattice of its squares, of which ``across`` at most are read along x.
+
+    It is in a search's memory: valid until the next of that memory is sorted.
+    """
     rows, columns = -(-level.shape[1] // TILES), -(-level.shape[2] // TILES)
-    width = columns + across
-    phases = np.zeros((len(WIDTHS), TILES, TILES, across + rows * width), np.int8)
+    phases = memory.zeros("phases", (len(WIDTHS), TILES, TILES, across + rows * (columns + across)))
+    _write_phases(level, across, columns + across, phases)
+    return PhasedLevel(phases, (rows, columns), across)
+
+
+@njit(cache=True)
+def _write_phases(level: Int8, across: int, width: int, phases: Int8) -> None:
     for c in range(len(WIDTHS)):
         for y in range(level.shape[1]):
             first = across + y // TILES * width
             for x in range(level.shape[2]):
                 phases[c, y % TILES, x % TILES, first + x // TILES] = level[c, y, x]
-    return PhasedLevel(phases, (rows, columns), across)
 
 
 class SquareRange(NamedTuple):
