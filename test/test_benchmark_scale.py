@@ -6,10 +6,23 @@ import pytest
 from benchmark.lattice import FIRST_KEYFRAME, PER_AREA, SPACING, Lattice, LatticeScans, make_stops, scan_at
 from benchmark.report import VALIDATION, document_marks
 from benchmark.scale import Cut, cost_of_scans, cut_requirement, growth_requirement, measured_cuts
+from benchmark.scale_events import event_requirements, event_table, time_events
 from benchmark.scale_maps import state_of, time_saving, weigh_areas
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.process_table import process_names
+
+
+def test_events_are_timed_in_a_map_that_is_older_and_of_a_robot_that_is_lost_in_it(monkeypatch):
+    monkeypatch.setattr("benchmark.scale_events._EXCURSIONS", 4)
+    monkeypatch.setattr("benchmark.scale_events._LENGTH", 2)
+    times = time_events(Lattice(4, 6), Configuration())
+    assert [len(own) for own in times.values()] == [4 * 5 * 7, 5 * 3]
+    assert all((own > 0.0).all() for own in times.values())
+    # Searches of the map take far longer than events without.
+    assert np.median(times["lost in the map"]) > 5.0 * np.median(times["driven beside the map and back into it"])
+    assert len(event_requirements(times)) == 4
+    assert "lost in the map" in event_table(times)
 
 
 def test_every_crossing_lies_where_the_arcs_place_it():

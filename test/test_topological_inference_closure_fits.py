@@ -102,7 +102,8 @@ def test_distances_are_means_to_the_nearest_descriptor_of_each_area():
 def test_areas_have_probabilities_by_the_ratio_of_their_similarity():
     rng = np.random.default_rng(3)
     descriptors = ScanDescriptors({})
-    descriptors._descriptors = {k: rng.normal(size=32) for k in range(8)}
+    descriptors._rows, table = {k: k for k in range(8)}, rng.normal(size=(8, 32))
+    descriptors._table = table
     areas = {3: (0, 1), 5: (2, 3), 9: (4, 5, 6)}
     similarity = descriptors.similarity([7], list(areas.values()))
     assert np.median(similarity) == 0.0
@@ -111,8 +112,7 @@ def test_areas_have_probabilities_by_the_ratio_of_their_similarity():
     found = descriptors.area_probabilities([7], areas)
     assert found == pytest.approx(dict(zip(areas, weights / weights.sum(), strict=True)))
     # Descriptors nearer than a thousandth are the same.
-    descriptors._descriptors[0] = descriptors._descriptors[7] + 1e-5
-    descriptors._descriptors[2] = descriptors._descriptors[7] + 5e-4
+    table[0], table[2] = table[7] + 1e-5, table[7] + 5e-4
     near = descriptors.similarity([7], list(areas.values()))
     assert near[0] == near[1] == 0.0
     assert near[2] < 0.0

@@ -46,6 +46,19 @@ def test_the_place_itself_is_the_most_similar(descriptors):
     assert np.median(similarity) == 0.0
 
 
+def test_descriptors_are_the_same_however_many_there_are_and_after_scans_changed():
+    scans = {k: make_scan(box(-1.0 - 0.02 * k, -1.0, 1.0, 1.0), 0.0, 0.0, 0.0, beams=45) for k in range(600)}
+    many, few = ScanDescriptors(scans), ScanDescriptors(scans)
+    areas = [tuple(range(k, k + 10)) for k in range(0, 600, 10)]
+    all_at_once = many.similarity([311], areas)
+    for area in areas:
+        few.similarity(area, areas[:1])
+    np.testing.assert_array_equal(few.similarity([311], areas), all_at_once)
+    scans[311] = scans[0]
+    many.clear()
+    assert many.similarity([311], areas).argmax() == 0
+
+
 def test_without_areas_there_is_no_similarity(descriptors):
     assert descriptors.similarity([9], []).shape == (0,)
     assert descriptors.area_probabilities([9], {}) == {}

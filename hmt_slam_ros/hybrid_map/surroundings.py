@@ -21,7 +21,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
-from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid
+from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid, build_coarse_grid
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 from hmt_slam_ros.sensors import Scan
 
@@ -48,6 +48,9 @@ _CACHE_BYTES = 4 << 25
 
 _COARSE_CACHE_BYTES = 3 << 25
 """Size of the coarse grids that global localization needs again and again, bytes: those of about forty regions."""
+
+_COARSE_SPEED = 3
+"""Cells of a coarse grid that are made in the time of one of a grid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,11 +280,6 @@ def _ignore(_: int) -> None:
     """Count nothing."""
 
 
-def _coarse_part(grid: AreaGrid) -> tuple[LogRatioGrid, int]:
-    """The log-ratios of a grid, and their size, bytes."""
-    return LogRatioGrid(grid.log_ratio, grid.origin, grid.cell), grid.log_ratio.nbytes
-
-
 class GridCache:
     """Grids and places, built from the keyframes' scans. The least recently used grids are evicted."""
 
@@ -342,12 +340,17 @@ class GridCache:
         return grid, grid.nbytes
 
     def coarse_grid(self, keyframes: Mapping[int, Pose]) -> LogRatioGrid:
-        """The log-ratios of :meth:`grid`, which take a sixth of its memory and outlast it."""
-        return self._coarse_grids.get(
-            keyframes,
-            lambda poses: _coarse_part(self.grid(poses)),
-            lambda poses: _coarse_part(self._rebuild(poses)[0]),
-        )
+        """The log-ratios of what the keyframes saw, which take a sixth of the memory of :meth:`grid` and outlast it."""
+        return self._coarse_grids.get(keyframes, self._build_coarse, self._rebuild_coarse)
+
+    def _build_coarse(self, keyframes: Mapping[int, Pose]) -> tuple[LogRatioGrid, int]:
+        grid, size = self._rebuild_coarse(keyframes)
+        self._count_cells(grid.log_ratio.size // _COARSE_SPEED)
+        return grid, size
+
+    def _rebuild_coarse(self, keyframes: Mapping[int, Pose]) -> tuple[LogRatioGrid, int]:
+        grid = build_coarse_grid([self._scans[k] for k in keyframes], stack_poses(keyframes), self._model)
+        return grid, grid.log_ratio.nbytes
 
     def grid_before(self, hybrid_map: HybridMap, poses: Mapping[int, Pose], keyframe: int) -> AreaGrid:
         """What the keyframes before a given one saw, of areas at ``poses``, {area: pose}."""

@@ -14,6 +14,7 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.se2 import transform_point
 from hmt_slam_ros.registration.consistency import Agreement
+from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 from hmt_slam_ros.sensors import Scan
 
 _MAX_GAP = 0.3
@@ -21,6 +22,9 @@ _MAX_GAP = 0.3
 
 _ON_SURFACE, _IN_FREE_SPACE = 0.3, -0.5
 """Log-ratios from which a sample is on a known surface, and in free space: 0.25 m or more from a surface."""
+
+_REACH = 5.0
+"""Distance from a surface up to which a grid knows it, in deviations of an end point."""
 
 _MARGIN = 3
 """Distance in which cells on every side of a sample have to be free, so that it is in free space, half cells."""
@@ -112,17 +116,49 @@ def build_area_grid(scans: Sequence[Scan], poses: Float64, model: GridModel) -> 
     hits, lasers, numbers = _end_points(scans, poses, model.max_range)
     if not len(hits):
         return _empty_grid(model.cell)
-    reach = 5.0 * model.sigma
+    origin, (rows, columns) = _extent(hits, lasers, model)
+    counts = _count_scans((rows, columns), origin, model.cell, lasers, hits, numbers)
+    fine = _log_ratios((2 * rows, 2 * columns), origin, hits, numbers, counts.free, model)
+    static = hits[_mark_static(hits, counts, origin, model.cell)]
+    return AreaGrid(origin, model.cell, _downsample(fine), fine, counts.free, thin_points(static, model.spacing))
+
+
+def build_coarse_grid(scans: Sequence[Scan], poses: Float64, model: GridModel) -> LogRatioGrid:
+    """The log-ratios of keyframes at the centers of the cells, which take a third of the time of the whole grid.
+
+    The arguments are those of :func:`build_area_grid`.
+    """
+    hits, lasers, numbers = _end_points(scans, poses, model.max_range)
+    if not len(hits):
+        empty = _empty_grid(model.cell)
+        return LogRatioGrid(empty.log_ratio, empty.origin, empty.cell)
+    origin, shape = _extent(hits, lasers, model)
+    free = _mark_free(shape, origin, model.cell, lasers, hits)
+    return LogRatioGrid(_log_ratios(shape, origin, hits, numbers, free, model), origin, model.cell)
+
+
+def _extent(hits: Float64, lasers: Float64, model: GridModel) -> tuple[Float64, tuple[int, int]]:
+    """The corner (2,) of a grid around end points and lasers, each (n, 2), m, and its numbers of rows and columns."""
+    reach = _REACH * model.sigma
     smallest, largest = _limits(np.concatenate((hits, lasers)))
     # The corner is a multiple of the cell, so that cells of all grids of an area coincide.
     origin = np.floor((smallest - reach) / model.cell) * model.cell
-    columns, rows = np.ceil((largest + reach - origin) / model.cell).astype(np.int64) + 1
-    counts = _count_scans((rows, columns), origin, model.cell, lasers, hits, numbers)
-    fine = np.full((2 * rows, 2 * columns), np.inf, dtype=np.float32)
-    _lower_distances(fine, origin, 0.5 * model.cell, hits, numbers, reach)
-    _convert_to_log_ratio(fine, counts.free, model.sigma, model.surface_ratio, model.free_ratio)
-    static = hits[_mark_static(hits, counts, origin, model.cell)]
-    return AreaGrid(origin, model.cell, _downsample(fine), fine, counts.free, thin_points(static, model.spacing))
+    columns, rows = (np.ceil((largest + reach - origin) / model.cell).astype(np.int64) + 1).tolist()
+    return origin, (rows, columns)
+
+
+def _log_ratios(
+    shape: tuple[int, int], origin: Float64, hits: Float64, numbers: Int64, free: Bool, model: GridModel
+) -> Float32:
+    """The log-ratios at the centers of cells, of which ``free`` has as many or half as many along an edge.
+
+    :param hits: end points, shape (n, 2), m; ``numbers`` (n,), of their scans.
+    """
+    log_ratios = np.full(shape, np.inf, dtype=np.float32)
+    cell = model.cell * (free.shape[0] / shape[0])
+    _lower_distances(log_ratios, origin, cell, hits, numbers, _REACH * model.sigma)
+    _convert_to_log_ratio(log_ratios, free, model.sigma, model.surface_ratio, model.free_ratio)
+    return log_ratios
 
 
 def surface_points(scan: Scan, model: GridModel) -> Float64:
@@ -206,22 +242,23 @@ def _limits(points: Float64) -> tuple[Float64, Float64]:
 
 @njit(cache=True)
 def _convert_to_log_ratio(fine: Float32, free: Bool, sigma: float, surface_ratio: float, free_ratio: float) -> None:
-    """Convert squared distances, in cells half as long as those of ``free``, to a blend of surface and free space.
+    """Convert squared distances to a blend of surface and free space; cells are those of ``free``, or quarters of them.
 
     Free space counts in full from two or three sigma on: beams that graze a wall see free space right up to it, and
     unequal flanks would pull a match away from the wall.
     """
-    log_free, far = np.log(free_ratio), np.float32(14.0 * sigma**2)
+    log_free, far, half = np.log(free_ratio), np.float32(14.0 * sigma**2), fine.shape[0] // free.shape[0] - 1
     for r in range(fine.shape[0]):
         for c in range(fine.shape[1]):
-            if fine[r, c] > far and not free[r // 2, c // 2]:
+            is_free = free[r >> half, c >> half]
+            if fine[r, c] > far and not is_free:
                 fine[r, c] = 0.0
                 continue
             if fine[r, c] == np.inf:
                 fine[r, c] = log_free
                 continue
             near = np.exp(-0.5 * fine[r, c] / sigma**2)
-            away = 1.0 + (free_ratio - 1.0) * (1.0 - np.sqrt(np.sqrt(near))) if free[r // 2, c // 2] else 1.0
+            away = 1.0 + (free_ratio - 1.0) * (1.0 - np.sqrt(np.sqrt(near))) if is_free else 1.0
             fine[r, c] = np.log(away + (surface_ratio - away) * (near if near >= 1e-3 else 0.0))
 
 
@@ -265,10 +302,7 @@ def _count_scans(
             last[row, column] = scan
             end += 1
         for k in range(begin, end):
-            x0, y0 = (lasers[k, 0] - origin[0]) / cell, (lasers[k, 1] - origin[1]) / cell
-            dx = (points[k, 0] - origin[0]) / cell - x0
-            dy = (points[k, 1] - origin[1]) / cell - y0
-            steps = int(np.ceil(max(abs(dx), abs(dy))))
+            x0, y0, dx, dy, steps = _beam_in_cells(lasers[k], points[k], origin, cell)
             for s in range(steps - 1):
                 row, column = int(y0 + dy * s / steps), int(x0 + dx * s / steps)
                 free[row, column] = True
@@ -276,6 +310,28 @@ def _count_scans(
                 last[row, column] = scan
         begin = end
     return _ScanCounts(free, passed, ended)
+
+
+@njit(cache=True)
+def _beam_in_cells(
+    laser: Float64, point: Float64, origin: Float64, cell: float
+) -> tuple[float, float, float, float, int]:
+    """Where a beam begins, (x, y), and its length along x and y, all in cells, and its number of steps."""
+    x, y = (laser[0] - origin[0]) / cell, (laser[1] - origin[1]) / cell
+    dx, dy = (point[0] - origin[0]) / cell - x, (point[1] - origin[1]) / cell - y
+    return x, y, dx, dy, int(np.ceil(max(abs(dx), abs(dy))))
+
+
+@njit(cache=True)
+def _mark_free(shape: tuple[int, int], origin: Float64, cell: float, lasers: Float64, points: Float64) -> Bool:
+    """Whether a beam from ``lasers`` to ``points``, each (n, 2), passed, up to one cell before its end point."""
+    free = np.zeros(shape, np.bool_)
+    for k in range(points.shape[0]):
+        x, y, dx, dy, steps = _beam_in_cells(lasers[k], points[k], origin, cell)
+        along_x, along_y = dx / max(1, steps), dy / max(1, steps)
+        for s in range(steps - 1):
+            free[int(y + along_y * s), int(x + along_x * s)] = True
+    return free
 
 
 @njit(cache=True)

@@ -129,7 +129,7 @@ class GlobalSearch:
     :ivar fitting_areas: the areas of the candidates' regions, and those around: a robot drives on.
     :ivar refuted: number of the candidates that were tested in vain.
     :ivar prepared: the area whose region's map was made at an earlier step, and which is matched next; else None.
-    :ivar is_map_missing: whether something fits there, so that the whole map of the region is made before.
+    :ivar is_map_missing: whether something fits in the next region, or is expected to, so that its whole map is made.
     """
 
     poses: Mapping[int, Pose]
@@ -169,7 +169,7 @@ def begin_search(
     near = None if pose_hint is None else _areas_near_hint(hybrid_map, pose_hint, radius, before)
     areas = {area: p for area, p in area_probabilities.items() if near is None or area in near}
     unexamined = {area: p for area, p in areas.items() if not only or area in only}
-    return GlobalSearch(poses, before, len(areas), unexamined)
+    return GlobalSearch(poses, before, len(areas), unexamined, is_map_missing=bool(only or pose_hint))
 
 
 def continue_search(
@@ -221,8 +221,7 @@ def _step(
         probabilities[first] = 1.0
     region = matcher.find_region(hybrid_map, search.before, probabilities)
     if search.prepared != region.reference or search.is_map_missing:
-        whole = search.is_map_missing and search.prepared == region.reference
-        matcher.prepare_region(hybrid_map, region, search.before, whole=whole)
+        matcher.prepare_region(hybrid_map, region, search.before, whole=search.is_map_missing)
         search = replace(search, prepared=region.reference, is_map_missing=False)
         if work.is_exhausted:
             return search

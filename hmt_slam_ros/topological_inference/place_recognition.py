@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import softmax
 
-from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.arrays import Bool, Float32, Float64
 from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.registration.area_to_area import MatchSettings, best_pose
@@ -30,6 +30,9 @@ from hmt_slam_ros.sensors import Scan
 
 DESCRIPTOR_SIZE = 32
 """Size of a descriptor: quantiles of the logarithm of the range."""
+
+_FIRST_ROWS = 256
+"""Rows of a table of descriptors at first."""
 
 _MIN_RANGE = 0.3
 """Shorter ranges count as this, m."""
@@ -82,9 +85,22 @@ _SHARE_TOLERANCE = 0.02
 
 def describe_scan(scan: Scan) -> Float64:
     """The descriptor of a scan: quantiles of log(range / 1 m) over all beams, shape (DESCRIPTOR_SIZE,)."""
-    ranges = np.where(scan.valid, scan.ranges, _MAX_RANGE).astype(np.float64)
-    ordered = np.sort(np.clip(ranges, _MIN_RANGE, _MAX_RANGE)) if ranges.size else np.array([_MAX_RANGE])
-    return np.log(ordered[((np.arange(DESCRIPTOR_SIZE) + 0.5) / DESCRIPTOR_SIZE * ordered.size).astype(np.int64)])
+    return _log_quantiles(scan.ranges, scan.valid)
+
+
+@njit(cache=True)
+def _log_quantiles(ranges: Float32, valid: Bool) -> Float64:
+    """The logarithms of DESCRIPTOR_SIZE quantiles of the ranges (n,), m, with the longest for those not valid."""
+    count = max(1, ranges.size)
+    limited = np.full(count, _MAX_RANGE)
+    for n in range(ranges.size):
+        if valid[n]:
+            limited[n] = min(max(np.float64(ranges[n]), _MIN_RANGE), _MAX_RANGE)
+    limited.sort()
+    quantiles = np.empty(DESCRIPTOR_SIZE)
+    for q in range(DESCRIPTOR_SIZE):
+        quantiles[q] = np.log(limited[int((q + 0.5) / DESCRIPTOR_SIZE * count)])
+    return quantiles
 
 
 def descriptor_log_ratio(similarity: Float64) -> Float64:
@@ -98,11 +114,12 @@ class ScanDescriptors:
     def __init__(self, scans: Mapping[int, Scan]) -> None:
         """:param scans: {keyframe: scan}, which may grow."""
         self._scans = scans
-        self._descriptors: dict[int, Float64] = {}
+        self._rows: dict[int, int] = {}
+        self._table: Float64 = np.empty((_FIRST_ROWS, DESCRIPTOR_SIZE))
 
     def clear(self) -> None:
         """Drop all descriptors, as scans have changed."""
-        self._descriptors.clear()
+        self._rows.clear()
 
     def similarity(self, keyframes: Collection[int], areas: Sequence[Collection[int]]) -> Float64:
         """Similarity of areas to some keyframes relative to the median area, shape (len(areas),).
@@ -129,10 +146,14 @@ class ScanDescriptors:
         return dict(zip(areas, probabilities.tolist(), strict=True))
 
     def _stack(self, keyframes: Collection[int]) -> Float64:
+        """The descriptors of keyframes, shape (len(keyframes), DESCRIPTOR_SIZE)."""
         for keyframe in keyframes:
-            if keyframe not in self._descriptors:
-                self._descriptors[keyframe] = describe_scan(self._scans[keyframe])
-        return np.array([self._descriptors[keyframe] for keyframe in keyframes]).reshape(-1, DESCRIPTOR_SIZE)
+            if keyframe not in self._rows:
+                self._rows[keyframe] = len(self._rows)
+                if len(self._rows) > len(self._table):
+                    self._table = np.concatenate((self._table, np.empty_like(self._table)))
+                self._table[self._rows[keyframe]] = describe_scan(self._scans[keyframe])
+        return self._table[[self._rows[keyframe] for keyframe in keyframes]]
 
 
 @njit(cache=True)
@@ -197,6 +218,6 @@ class PerceptualAliasing:
 
         :param already_expected: whether the match follows from that of earlier keyframes.
         """
-        as_good = sum(other > share - _SHARE_TOLERANCE for other in self.negative_shares)
+        as_good = int((np.fromiter(self.negative_shares, np.float64) > share - _SHARE_TOLERANCE).sum())
         value = math.log((_PRIOR_COUNT + len(self.negative_shares)) / (_PRIOR_COUNT * self.prior + as_good))
         return min(value, -math.log(_ALIASING_PERSISTENCE)) if already_expected else value
