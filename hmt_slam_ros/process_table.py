@@ -97,7 +97,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
         consumes=("Scan", "Odometry", "PoseReset", "Hypotheses", "ClosureDecision", "EndOfLog"),
         factory=f"{_COMPOSITION}:metric_slam",
         state="hmt_slam_ros.metric_slam.slam:SlamState",
-        produces=("TrackingReset", "Keyframe", "ScanPoses", "LocalEstimate", "EndOfRun"),
+        produces=("TrackingReset", "Keyframe", "ScanPoses", "LocalEstimate", "EarlyEstimate", "EndOfRun"),
     ),
     ProcessRow(
         name="aam",
@@ -129,7 +129,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
         name="rtl",
         title="real-time localization",
         node_class=f"{_ROS}.publishing_nodes:RtlNode",
-        consumes=("Odometry", "TrackingReset", "LocalEstimate", "Hypotheses", "ClosureDecision"),
+        consumes=("Odometry", "TrackingReset", "LocalEstimate", "EarlyEstimate", "Hypotheses", "ClosureDecision"),
         factory="hmt_slam_ros.real_time_localization.rtl:Rtl",
         state="hmt_slam_ros.real_time_localization.rtl:RtlState",
         produces=("RealTimePose",),
@@ -179,6 +179,7 @@ DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow(f"{_DOCUMENTS}:ResetRequest", "hmt/reset_request", "reset_request", 1),
     DocumentRow(f"{_DOCUMENTS}:ResetResponse", "hmt/reset_response", "reset_response", 1),
     DocumentRow("hmt_slam_ros.messages.tasks:PlaceEstimate", "pilot/place_estimate", "place_estimate", 2),
+    DocumentRow(f"{_MESSAGES}:EarlyEstimate", "hmt/early_estimate", "early_estimate", 1),
 )
 """Messages that travel as JSON documents."""
 

@@ -11,7 +11,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import AreaPose
-from hmt_slam_ros.messages.messages import ClosureDecision, LocalEstimate, Notice
+from hmt_slam_ros.messages.messages import ClosureDecision, EarlyEstimate, LocalEstimate, Notice, TrackingReset
 from hmt_slam_ros.real_time_localization.rtl import CorrectionSmoother, Rtl
 from hmt_slam_ros.sensors import Odometry
 from hmt_slam_ros.sensors.relative_motion import path_covariance
@@ -26,6 +26,11 @@ def odometry(seconds, x, y, theta):
 def estimate(seconds, pose, odom, area=0, variance=1e-4):
     belief = PoseGaussian(np.array(pose, dtype=np.float64), np.eye(3) * variance)
     return LocalEstimate(round(seconds * SECOND), 0, area, belief, np.array(odom, dtype=np.float64), 0)
+
+
+def early_estimate(seconds, pose, odom, area=0, event=0):
+    final = estimate(seconds, pose, odom, area)
+    return EarlyEstimate(final.stamp, 0, event, area, final.pose, final.odometry)
 
 
 def make_decision(**areas):
@@ -274,3 +279,68 @@ def test_when_an_estimate_arrives_does_not_matter_only_which_scan_it_is_of(steps
     assert np.allclose(answer[0][0].pose_in_area.mean, answer[1][0].pose_in_area.mean)
     assert np.allclose(answer[0][0].pose_in_area.covariance, answer[1][0].pose_in_area.covariance)
     assert np.allclose(answer[0][0].pose_in_area.mean, se2.compose((1, 2, 3), se2.between(poses[0], poses[-1])))
+
+
+def drive_to(rtl, seconds):
+    """The last pose of a drive of 1 m/s, with a reading every tenth of a second after the first second."""
+    answers = [rtl.handle(odometry(0.1 * k, 0.1 * k, 0, 0)) for k in range(1, round(10 * seconds) + 1)]
+    return answers[-1][0]
+
+
+def test_an_early_estimate_counts_until_there_is_one_that_is_as_new(rtl):
+    rtl.handle(odometry(0.0, 0, 0, 0))
+    rtl.handle(estimate(0.0, (0, 0, 0), (0, 0, 0)))
+    assert np.allclose(drive_to(rtl, 1.0).pose_in_area.mean, (1, 0, 0))
+    before = rtl.state
+    rtl.handle(early_estimate(0.45, (5.45, 0, 0), (0.45, 0, 0)))
+    (answer,) = rtl.handle(odometry(1.1, 1.1, 0, 0))
+    assert np.allclose(answer.pose_in_area.mean, (6.1, 0, 0))
+    # An older one of either kind changes nothing.
+    rtl.handle(early_estimate(0.4, (0, 9, 0), (0.4, 0, 0)))
+    rtl.handle(estimate(0.3, (0.3, 1, 0), (0.3, 0, 0)))
+    (answer,) = rtl.handle(odometry(1.2, 1.2, 0, 0))
+    assert np.allclose(answer.pose_in_area.mean, (6.2, 0, 0))
+    rtl.handle(estimate(0.45, (0.45, 2, 0), (0.45, 0, 0)))
+    (answer,) = rtl.handle(odometry(1.3, 1.3, 0, 0))
+    assert np.allclose(answer.pose_in_area.mean, (1.3, 2, 0))
+    assert before.base_estimate is not rtl.state.base_estimate
+
+
+def test_the_state_is_that_without_early_estimates(rtl):
+    plain = Rtl(Configuration())
+    for own in (rtl, plain):
+        own.handle(odometry(0.0, 0, 0, 0))
+        own.handle(estimate(0.0, (0, 0, 0), (0, 0, 0)))
+        drive_to(own, 1.0)
+        if own is rtl:
+            own.handle(early_estimate(0.5, (5, 0, 0), (0.5, 0, 0)))
+        own.handle(odometry(1.1, 1.1, 0, 0))
+    one, two = rtl.state, plain.state
+    assert [reading.stamp for reading in one.readings] == [reading.stamp for reading in two.readings]
+    assert (one.base_estimate.stamp, one.base_reading.stamp) == (two.base_estimate.stamp, two.base_reading.stamp)
+
+
+def test_an_early_estimate_in_an_area_without_a_pose_in_the_map_waits_for_it(rtl):
+    rtl.handle(odometry(0.0, 0, 0, 0))
+    rtl.handle(estimate(0.0, (0, 0, 0), (0, 0, 0)))
+    rtl.handle(early_estimate(0.0, (0, 0, 0), (0, 0, 0), area=3))
+    drive_to(rtl, 0.5)
+    rtl.handle(early_estimate(0.5, (2, 0, 0), (0.5, 0, 0), area=3))
+    (answer,) = rtl.handle(odometry(0.6, 0.6, 0, 0))
+    assert answer.area == 0
+    rtl.handle(make_decision(a0=(0, 0, 0), a3=(10, 0, 0)))
+    (answer,) = rtl.handle(odometry(0.7, 0.7, 0, 0))
+    assert answer.area == 3
+    assert np.allclose(answer.map_pose.mean, (12.2, 0, 0))
+
+
+def test_early_estimates_of_before_a_reset_are_dropped(rtl):
+    rtl.handle(odometry(0.0, 0, 0, 0))
+    rtl.handle(early_estimate(0.0, (1, 0, 0), (0, 0, 0), event=4))
+    rtl.handle(TrackingReset(5, 7))
+    rtl.handle(odometry(0.1, 0.1, 0, 0))
+    rtl.handle(early_estimate(0.1, (1, 0, 0), (0.1, 0, 0), event=4))
+    assert rtl.handle(odometry(0.2, 0.2, 0, 0)) == []
+    rtl.handle(early_estimate(0.2, (1, 0, 0), (0.2, 0, 0), event=5))
+    (answer,) = rtl.handle(odometry(0.3, 0.3, 0, 0))
+    assert np.allclose(answer.pose_in_area.mean, (1.1, 0, 0))

@@ -234,6 +234,26 @@ class LocalEstimate:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class EarlyEstimate:
+    """slam -> rtl: estimate of a scan that waits for the answer to a keyframe event; its ``LocalEstimate`` follows.
+
+    :ivar stamp: stamp of the scan, ns.
+    :ivar scan_index: as in ``LocalEstimate``; not all scans have an early estimate.
+    :ivar event: the keyframe event.
+    :ivar area: area of the hypothesis that was the most probable at the event.
+    :ivar pose: belief over ``area_T_base`` at the scan.
+    :ivar odometry: shape (3,), ``odom_T_base`` at the scan.
+    """
+
+    stamp: int
+    scan_index: int
+    event: int
+    area: int
+    pose: PoseGaussian
+    odometry: Pose
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class ScanPoses:
     """slam -> tlca, recorder: poses of the scans since the last message, under one hypothesis.
 
@@ -353,6 +373,7 @@ Message = (
     | Hypotheses
     | ClosureDecision
     | LocalEstimate
+    | EarlyEstimate
     | ScanPoses
     | RealTimePose
     | PoseReset

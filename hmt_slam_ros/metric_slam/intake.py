@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
@@ -120,6 +121,11 @@ class ScanQueue:
         return bool(self._scans) and (
             ended or not self._state.waits_for_odometry or self._odometry.covers(self._scans[0].end_stamp)
         )
+
+    def ready_scans(self) -> list[Scan]:
+        """The first scans that can be processed; they stay in the queue."""
+        waits = self._state.waits_for_odometry
+        return list(takewhile(lambda scan: not waits or self._odometry.covers(scan.end_stamp), self._scans))
 
     @property
     def next_scan(self) -> Scan:

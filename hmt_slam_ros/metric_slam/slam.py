@@ -31,6 +31,7 @@ from hmt_slam_ros.lifelong.change_detection import (
 from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.messages.messages import (
     ClosureDecision,
+    EarlyEstimate,
     EndOfLog,
     EndOfRun,
     Hypotheses,
@@ -45,6 +46,7 @@ from hmt_slam_ros.messages.messages import (
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
 from hmt_slam_ros.metric_slam.intake import OdometryMonitor, OdometryMonitorState, ScanQueue, ScanQueueState
 from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis, LiveHypothesisState
+from hmt_slam_ros.metric_slam.look_ahead import LookAhead
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.sensors.motion_model import MotionModel, MotionState, Prediction
 from hmt_slam_ros.sensors.odometry import deskew_scan
@@ -98,7 +100,7 @@ class MetricSlam:
     """The metric SLAM process.
 
     Consumes Scan, Odometry, PoseReset, Hypotheses, ClosureDecision, EndOfLog; produces TrackingReset, Keyframe,
-    ScanPoses, LocalEstimate, Notice, EndOfRun.
+    ScanPoses, LocalEstimate, Notice, EndOfRun; and EarlyEstimate, where :meth:`look_ahead` is called.
 
     :ivar mode: mapping, localization or lifelong; a lost robot maps its surroundings in every mode.
     """
@@ -137,6 +139,9 @@ class MetricSlam:
             live_hypotheses={},
         )
         self._ended = False
+        # Not part of the state, since no decision depends on it.
+        self._look_ahead: LookAhead | None = None
+        self._next_early = 0
 
     def _restored_hypotheses(self, state: SlamState) -> dict[int, LiveHypothesis]:
         if not state.live_hypotheses:
@@ -227,9 +232,13 @@ class MetricSlam:
         """Process a message, and the scans that are ready then; returns the answers."""
         if isinstance(message, Odometry):
             self._scan_queue.add_odometry(message)
-        elif isinstance(message, Scan):
+            if self._look_ahead is not None:
+                self._look_ahead.add_odometry(message)
+            return self._process_queue()
+        if isinstance(message, Scan):
             return self._scan_queue.add_scan(message) + self._process_queue()
-        elif isinstance(message, Hypotheses):
+        self._look_ahead = None  # whose map changes
+        if isinstance(message, Hypotheses):
             self._apply_hypotheses(message)
         elif isinstance(message, ClosureDecision):
             self._apply_decision(message)
@@ -239,6 +248,28 @@ class MetricSlam:
         elif isinstance(message, EndOfLog):
             self._ended = True
         return self._process_queue()
+
+    def look_ahead(self) -> list[EarlyEstimate]:
+        """Estimates of the scans that wait for the answer to a keyframe event, as far as they have none yet.
+
+        Results are the same without them.
+        """
+        if not self._state.awaiting_decision or self._state.reset_pending:
+            return []
+        scans = self._scan_queue.ready_scans()
+        if self._state.processed_scans + len(scans) <= self._next_early:
+            return []
+        ahead = self._look_ahead or LookAhead(
+            self._configuration,
+            self._mapping,
+            self._best_hypothesis,
+            self._motion.state,
+            self._state.keyframe_events - 1,
+            self._next_early,
+        )
+        estimates = ahead.estimate(scans, self._state.processed_scans)
+        self._look_ahead, self._next_early = ahead, ahead.next_scan
+        return estimates
 
     def _process_queue(self) -> list[Message]:
         answers: list[Message] = []
@@ -257,6 +288,7 @@ class MetricSlam:
     def _reset_tracking(self) -> list[Message]:
         """Restart tracking at the next scan; scans that still wait are dropped, as they are from before."""
         self._motion, self._odometry_monitor = MotionModel(self._configuration.motion), OdometryMonitor()
+        self._next_early = 0
         dropped = self._state.dropped_scans + len(self._scan_queue)
         self._scan_queue = self._scan_queue.empty_copy(self._motion.odometry)
         self._state = replace(self._state, dropped_scans=dropped, reset_pending=True, motion_condition="ordinary")

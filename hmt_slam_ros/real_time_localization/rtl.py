@@ -19,7 +19,15 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import AreaPose
-from hmt_slam_ros.messages.messages import ClosureDecision, LocalEstimate, Message, Notice, RealTimePose, TrackingReset
+from hmt_slam_ros.messages.messages import (
+    ClosureDecision,
+    EarlyEstimate,
+    LocalEstimate,
+    Message,
+    Notice,
+    RealTimePose,
+    TrackingReset,
+)
 from hmt_slam_ros.messages.replica import FIRST_AREA, GlobalPoses
 from hmt_slam_ros.sensors import Odometry
 from hmt_slam_ros.sensors.relative_motion import path_covariance
@@ -81,9 +89,24 @@ class RtlState:
     ambiguity: Float64 = field(default_factory=partial(np.zeros, (3, 3)))
 
 
+class _Base(NamedTuple):
+    """What the pose is based on.
+
+    :ivar estimate: of a scan.
+    :ivar area_pose: ``map_T_area`` of its area.
+    :ivar reading: at the scan.
+    """
+
+    estimate: LocalEstimate | EarlyEstimate
+    area_pose: PoseGaussian
+    reading: OdometryPathPoint
+
+
 class Rtl:
-    """The RTL process. Consumes Odometry, TrackingReset, LocalEstimate, ClosureDecision; produces RealTimePose,
-    Notice."""
+    """The RTL process.
+
+    Consumes Odometry, TrackingReset, LocalEstimate, EarlyEstimate, ClosureDecision; produces RealTimePose, Notice.
+    """
 
     def __init__(self, configuration: Configuration, state: RtlState | None = None) -> None:
         """:param state: to go on from."""
@@ -94,7 +117,10 @@ class Rtl:
         # All but the readings, which change at the rate of the odometry.
         self._state = replace(state, readings=())
         # Estimates of earlier scans are from before a reset; a state is saved when none of these is pending.
-        self._first_valid_scan = 0
+        self._first_valid_scan, self._first_valid_event = 0, 0
+        # Not part of the state either: it holds until the next estimate.
+        self._early: EarlyEstimate | None = None
+        self._early_reading: OdometryPathPoint | None = None
 
     @property
     def state(self) -> RtlState:
@@ -110,13 +136,25 @@ class Rtl:
             if message.scan_index >= self._first_valid_scan and (newest is None or message.stamp > newest.stamp):
                 self._state = replace(self._state, newest_estimate=message)
                 self._update_base()
+        elif isinstance(message, EarlyEstimate):
+            self._on_early_estimate(message)
         elif isinstance(message, ClosureDecision):
             self._on_closure_decision(message)
         elif isinstance(message, TrackingReset):
-            self._first_valid_scan = message.scans_before
+            self._first_valid_scan, self._first_valid_event = message.scans_before, message.event
+            self._early = None
             self._readings.clear()
             self._state = replace(self._state, newest_estimate=None, base_estimate=None, base_reading=None)
         return []
+
+    def _on_early_estimate(self, estimate: EarlyEstimate) -> None:
+        """Keep the newest early estimate, with the reading at its scan."""
+        is_newer = self._early is None or estimate.stamp > self._early.stamp
+        if not is_newer or estimate.event < self._first_valid_event or not self._readings:
+            return
+        before = next((reading for reading in reversed(self._readings) if reading.stamp <= estimate.stamp), None)
+        reading = self._readings[0] if before is None else before
+        self._early, self._early_reading = estimate, reading.with_measured(estimate.odometry)
 
     def _on_closure_decision(self, decision: ClosureDecision) -> None:
         self._state = replace(self._state, ambiguity=decision.ambiguity)
@@ -172,27 +210,40 @@ class Rtl:
 
     def _predict(self) -> list[Message]:
         """The estimate, propagated by the odometry since its scan."""
-        estimate, start, now = self._state.base_estimate, self._state.base_reading, self._readings[-1]
-        if estimate is None:
+        base, now = self._base(), self._readings[-1]
+        base = self._early_base() or base
+        if base is None:
             return []
-        if start is None:
-            start = self._readings[0].with_measured(estimate.odometry)
-            self._state = replace(self._state, base_reading=start)
+        estimate, start = base.estimate, base.reading
         since = PoseGaussian(
             se2.between(start.reset_free, now.reset_free),
             path_covariance(now.distance - start.distance, min(now.angle - start.angle, math.pi), self._motion),
         )
         return [
             RealTimePose(
-                now.stamp,
-                estimate.area,
-                self._state.base_area_pose,
-                estimate.pose,
-                since,
-                now.measured,
-                self._state.ambiguity,
+                now.stamp, estimate.area, base.area_pose, estimate.pose, since, now.measured, self._state.ambiguity
             )
         ]
+
+    def _base(self) -> _Base | None:
+        """The last estimate in an area whose pose in the map is known."""
+        estimate, reading = self._state.base_estimate, self._state.base_reading
+        if estimate is None:
+            return None
+        if reading is None:
+            reading = self._readings[0].with_measured(estimate.odometry)
+            self._state = replace(self._state, base_reading=reading)
+        return _Base(estimate, self._state.base_area_pose, reading)
+
+    def _early_base(self) -> _Base | None:
+        """The early estimate, where it is newer than the last estimate, and its area's pose in the map is known."""
+        early, reading, newest = self._early, self._early_reading, self._state.newest_estimate
+        if early is None or reading is None or (newest is not None and early.stamp <= newest.stamp):
+            return None
+        base = self._state.base_estimate
+        known = self._state.base_area_pose if base is not None and base.area == early.area else None
+        pose = known or GlobalPoses(self._state.area_poses).get(early.area)
+        return None if pose is None else _Base(early, pose, reading)
 
 
 def _reset_notice(stamp: int, distance: float, angle: float) -> Notice:

@@ -16,6 +16,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.documents import FinalCounts, KeyframeHeader, encode
 from hmt_slam_ros.messages.gate import ChainGate, check_message, decode_checked
 from hmt_slam_ros.messages.messages import (
+    EarlyEstimate,
     EndOfRun,
     Keyframe,
     LocalEstimate,
@@ -163,7 +164,7 @@ class Inbox:
             )
             self._odometry.start()
         elif kind in DOCUMENTS:
-            profile = self._estimate_profile if kind is LocalEstimate else topics.CHAIN
+            profile = {LocalEstimate: self._estimate_profile, EarlyEstimate: topics.STREAM}.get(kind, topics.CHAIN)
             self._subscribe(String, DOCUMENTS[kind], lambda message: self._on_document(message, kind), profile)
 
     def _subscribe(
@@ -324,6 +325,9 @@ class Outbox:
         if kind is EndOfRun:
             finals = ChainWriter(self._node, String, FINISHED, topics.CHAIN_HISTORY)
             return lambda totals: finals.publish(self._document(self._final_counts(totals)))
+        if kind is EarlyEstimate:
+            early = self._node.create_publisher(String, DOCUMENTS[kind], topics.STREAM)
+            return lambda estimate: early.publish(self._document(estimate))
         profile = topics.ESTIMATE_HISTORY if kind is LocalEstimate else topics.CHAIN_HISTORY
         documents = ChainWriter(self._node, String, DOCUMENTS[kind], profile)
         return lambda message: documents.publish(self._document(message))

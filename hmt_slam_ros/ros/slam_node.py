@@ -20,8 +20,17 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.documents import RobotStatus
 from hmt_slam_ros.messages.gate import check_belief
 from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
-from hmt_slam_ros.messages.messages import ClosureDecision, EndOfLog, Keyframe, LocalEstimate, Message, PoseReset
+from hmt_slam_ros.messages.messages import (
+    ClosureDecision,
+    EndOfLog,
+    Keyframe,
+    LocalEstimate,
+    Message,
+    PoseReset,
+    TrackingReset,
+)
 from hmt_slam_ros.messages.replica import FIRST_AREA
+from hmt_slam_ros.metric_slam.look_ahead import EarlyEstimateRecord
 from hmt_slam_ros.process_table import process_row
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
@@ -120,6 +129,7 @@ class SlamNode(MapServicesNode):
         self._area_poses: dict[int, AreaPose] = {}
         self.estimate: LocalEstimate | None = None
         self._is_map_unchanged = True
+        self._early_estimates = EarlyEstimateRecord()
         self._adopt_map()
         self._held: deque[Message] = deque()
         self._saver = MapSaver(self, self._deliver_held)
@@ -275,10 +285,20 @@ class SlamNode(MapServicesNode):
         ):
             super().deliver(PoseReset())
         super().deliver(message)
+        self._publish_early_estimates()
         if self._end_status is not None:
             self._end_log_if_complete()
         self._saver.start_if_ready()
         self._loader.start_if_ready()
+
+    def _publish_early_estimates(self) -> None:
+        """Publish where the robot is at scans that wait for an answer."""
+        if self.is_recovering:
+            return
+        for estimate in self.process.look_ahead():
+            self.outbox.send(estimate)
+            self._early_estimates.add(estimate)
+            self.diagnostics.sent[type(estimate).__name__] += 1
 
     def _deliver_held(self) -> None:
         """Deliver the held messages."""
@@ -350,6 +370,7 @@ class SlamNode(MapServicesNode):
 
     def _check_inputs(self) -> None:
         """Report missing inputs once a second, and stop to wait for lost scans."""
+        self.diagnostics.values["early estimates"] = str(self._early_estimates)
         self.diagnostics.values["waiting scans"] = self.process.queued_scans + self._scan_intake.waiting_count
         self.deliver_ready_scans()
         self._scan_intake.warn_if_waiting()
@@ -366,8 +387,11 @@ class SlamNode(MapServicesNode):
         if isinstance(message, ClosureDecision) and message.global_poses:
             self._area_poses = {entry.area: entry for entry in message.global_poses}
         for output in outputs:
+            if isinstance(output, TrackingReset):
+                self._early_estimates.clear()
             if isinstance(output, LocalEstimate):
                 self.estimate = output
+                self._early_estimates.compare(output)
             if isinstance(output, Keyframe):
                 self._report_particles(output)
                 self._publish_particles(output.scan.stamp)

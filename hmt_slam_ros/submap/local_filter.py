@@ -192,7 +192,7 @@ class LocalFilter(Protocol):
         """Set the belief over ``map_T_base``, and predict from there."""
 
     def track(self, prepared: PreparedScan, prediction: Prediction) -> TrackedMotion:
-        """Match a scan between two keyframes."""
+        """Match a scan between two keyframes. It replaces what it changes, so that a shallow copy can track instead."""
 
     def update(self, prepared: PreparedScan, step: int) -> FilterStep:
         """The filter step with the scan of a keyframe, which was tracked before.

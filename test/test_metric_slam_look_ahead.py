@@ -1,0 +1,195 @@
+"""Early estimates of scans that wait for an answer: there at once, near the truth, and without effect on the rest."""
+
+import pickle
+from collections import deque
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_metric_slam import Dialogue, agree, drive
+
+from hmt_slam_ros.composition import metric_slam
+from hmt_slam_ros.configuration import load_configuration
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.messages.map_changes import LocalArea
+from hmt_slam_ros.messages.messages import (
+    ClosureDecision,
+    EndOfLog,
+    Hypotheses,
+    Hypothesis,
+    Keyframe,
+    LocalEstimate,
+    PoseReset,
+)
+from hmt_slam_ros.messages.routing import SUBSCRIPTIONS
+from hmt_slam_ros.metric_slam.look_ahead import EarlyEstimateRecord
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.process_table import PROCESSES
+
+BUNDLED = Path(__file__).resolve().parent.parent / "data" / "malaga_one_loop"
+
+
+class Waiting(Dialogue):
+    """A metric SLAM process whose first event gets no answer by itself, and its early estimates."""
+
+    def __init__(self, configuration=None):
+        super().__init__(configuration, answer=lambda keyframe: agree(keyframe) if keyframe.sequence else [])
+        self.early = []
+
+    def send(self, *messages):
+        super().send(*messages)
+        self.early += self.slam.look_ahead()
+        return self
+
+
+@pytest.mark.parametrize("kind", ["grid", "lines"])
+def test_scans_that_wait_have_estimates_at_once_and_the_same_afterwards_as_without(kind):
+    configuration = load_configuration(settings=[f"local_map.kind={kind}"])
+    ahead, plain = Waiting(), Dialogue(answer=lambda keyframe: [])
+    ahead.slam, plain.slam = metric_slam(configuration), metric_slam(configuration)
+    for number, (odometry, scan, pose) in enumerate(drive(25)):
+        ahead.send(odometry, scan)
+        plain.send(odometry, scan)
+        if number:
+            (estimate,) = ahead.early[number - 1 :]
+            assert (estimate.stamp, estimate.scan_index, estimate.event) == (scan.stamp, number, 0)
+            assert np.hypot(*se2.between(pose, estimate.pose.mean)[:2]) < 0.05
+            np.testing.assert_array_equal(estimate.odometry, odometry.pose)
+    assert (ahead.slam.queued_scans, ahead.slam.processed_scans) == (24, 1)
+    assert pickle.dumps(ahead.slam.state) == pickle.dumps(plain.slam.state)
+    plain.answer = agree
+    for dialogue in (ahead, plain):
+        dialogue.send(*agree(dialogue.messages_of(Keyframe)[0]))
+    assert pickle.dumps(ahead.slam.state) == pickle.dumps(plain.slam.state)
+    assert pickle.dumps(ahead.answers) == pickle.dumps(plain.answers)
+    assert len(ahead.messages_of(LocalEstimate)) == 25
+    # None for scans that have had one, though the last ones wait for the next answer.
+    assert len(ahead.early) == 24
+
+
+def test_of_many_that_wait_the_newest_alone_has_one():
+    dialogue = Waiting()
+    steps = list(drive(31))
+    for odometry, scan, _ in steps[:30]:
+        Dialogue.send(dialogue, odometry, scan)
+    assert [estimate.scan_index for estimate in dialogue.slam.look_ahead()] == [29]
+    dialogue.send(*steps[30][:2])
+    assert [estimate.scan_index for estimate in dialogue.early] == [30]
+    assert np.hypot(*se2.between(steps[30][2], dialogue.early[0].pose.mean)[:2]) < 0.05
+
+
+def test_a_scan_whose_odometry_is_not_known_waits():
+    dialogue = Waiting()
+    (odometry, scan, _), (later, second, _) = drive(2)
+    dialogue.send(odometry, scan, second)
+    assert dialogue.early == []
+    dialogue.send(later)
+    assert [estimate.scan_index for estimate in dialogue.early] == [1]
+
+
+def test_it_goes_on_in_the_area_of_the_hypotheses_until_the_decision():
+    dialogue = Waiting()
+    steps = list(drive(4))
+    for odometry, scan, _ in steps[:3]:
+        dialogue.send(odometry, scan)
+    moved = Hypothesis(0, 0, 1.0, 0, local_areas=(LocalArea(0, np.zeros(3)),))
+    dialogue.send(Hypotheses(0, (moved,)))
+    dialogue.send(*steps[3][:2])
+    assert [estimate.scan_index for estimate in dialogue.early] == [1, 2, 3]
+    dialogue.send(ClosureDecision(0))
+    assert len(dialogue.messages_of(LocalEstimate)) == 4
+
+
+def test_there_is_none_after_a_reset_until_the_robot_is_tracked_again():
+    dialogue = Waiting()
+    for odometry, scan, _ in drive(5):
+        dialogue.send(odometry, scan)
+    count = len(dialogue.early)
+    dialogue.send(PoseReset())
+    for odometry, scan, _ in drive(3, start=5):
+        dialogue.send(odometry, scan)
+    assert len(dialogue.early) == count
+    dialogue.answer = lambda keyframe: [] if keyframe.sequence == 1 else agree(keyframe)
+    dialogue.send(*agree(dialogue.messages_of(Keyframe)[0]))
+    assert [(estimate.scan_index, estimate.event) for estimate in dialogue.early[count:]] == [(3, 1)]
+
+
+def test_the_record_tells_how_far_they_were_off():
+    dialogue, record = Waiting(), EarlyEstimateRecord()
+    for odometry, scan, _ in drive(8):
+        dialogue.send(odometry, scan)
+    for estimate in dialogue.early:
+        record.add(estimate)
+    dialogue.send(*agree(dialogue.messages_of(Keyframe)[0]))
+    first, second, *others = dialogue.messages_of(LocalEstimate)[1:]
+    off = replace(second.pose, mean=second.pose.mean + np.array([0.3, 0.4, 0.0]))
+    for estimate in (replace(first, area=7), replace(second, pose=off), *others):
+        record.compare(estimate)
+    assert str(record) == "7, 1 of them then in another area, the others off by 0.50 m"
+    record.clear()
+
+
+class DelayedRun:
+    """The five processes, in which measurements come before answers to earlier ones, and processes are made again."""
+
+    def __init__(self, configuration, seed):
+        self.configuration, self.random = configuration, np.random.default_rng(seed)
+        self.processes = {row.name: row.make(configuration, None) for row in PROCESSES}
+        self.pending, self.sent, self.early = deque(), [], 0
+
+    def run(self, measurements, lock_step=False):
+        """Feed measurements, each as soon as chance has it; without a chance, once nothing is pending."""
+        inputs = deque([*measurements, EndOfLog()])
+        while inputs or self.pending:
+            # The end of the log comes when all is answered, as the nodes hold it back.
+            may_come = inputs and (not self.pending or (not lock_step and len(inputs) > 1))
+            if may_come and (not self.pending or self.random.random() < 0.6):
+                self._deliver(inputs.popleft())
+            else:
+                self._deliver(self.pending.popleft())
+            if inputs and not lock_step:
+                self._disturb()
+        return self
+
+    def _deliver(self, message):
+        self.sent.append(message)
+        for name, process in self.processes.items():
+            if isinstance(message, SUBSCRIPTIONS[name]):
+                self.pending.extend(process.handle(message))
+
+    def _disturb(self):
+        if self.random.random() < 0.2:
+            self.early += len(self.processes["slam"].look_ahead())
+        if self.random.random() < 0.01:
+            # The others have a state between two events only.
+            row = PROCESSES[self.random.integers(1 if self.pending else len(PROCESSES))]
+            self.processes[row.name] = row.make(self.configuration, deepcopy(self.processes[row.name].state))
+
+    def chain(self):
+        """The messages of keyframe events, and the estimates, as bytes."""
+        kinds = (Keyframe, Hypotheses, ClosureDecision, LocalEstimate)
+        return {kind.__name__: [pickle.dumps(m) for m in self.sent if isinstance(m, kind)] for kind in kinds}
+
+
+@pytest.fixture(scope="module")
+def measurements():
+    """Those of a log in which a loop is closed."""
+    return [record.measurement for record in open_log(BUNDLED).records()]
+
+
+@pytest.fixture(scope="module")
+def in_lock_step(measurements):
+    return DelayedRun(Configuration(), 0).run(measurements, lock_step=True).chain()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_however_late_answers_come_and_whatever_is_made_again_decisions_are_the_same(measurements, in_lock_step, seed):
+    delayed = DelayedRun(Configuration(), seed).run(measurements)
+    assert delayed.early > 50
+    found = delayed.chain()
+    assert len(in_lock_step["Keyframe"]) > 50
+    for kind, messages in in_lock_step.items():
+        assert found[kind] == messages, kind
