@@ -160,3 +160,15 @@ def test_a_robot_is_localized_until_it_is_lost_or_tracking_is_reset():
     assert run.tsbi.localization == (True, 0.0)
     run.tsbi.handle(TrackingReset(3, 9))
     assert run.tsbi.localization == (False, pytest.approx(entropy))
+
+
+def test_keyframes_without_a_surface_that_stayed_fit_nowhere():
+    """Beside a robot that people follow, all end points may be on people."""
+    grid = module.AreaGrid(
+        np.zeros(2), 0.1, np.zeros((9, 9)), np.zeros((18, 18), np.float32), np.zeros((9, 9), bool), np.zeros((0, 2))
+    )
+    surface = LogRatioGrid(np.zeros((9, 9), np.float32), np.zeros(2), 0.1)
+    cache = SimpleNamespace(coarse_grid=lambda _known: surface)
+    matcher = GlobalScanMatcher(cache, None, MatchSettings(), 1.5, 6.0)
+    known = {1: np.array([0.0, 0.0, 0.3])}
+    assert matcher._match_keyframes(known, np.array([2]), grid, {7: np.zeros(3)}, {2}, 0.8) == ([], 0)

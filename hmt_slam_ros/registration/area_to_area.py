@@ -154,6 +154,8 @@ def find_cells(
     :param candidate_points: its surface points, shape (n, 2), m, for the reverse check.
     :param constraint: limits on the positions of the query's keyframes, if any.
     """
+    if not query.points.size:
+        return SearchCells(np.empty((0, 3), dtype=np.int64), np.empty(0), np.empty(0))
     centered = _center(query, candidate.cell, prior, settings, bounds)
     back_points = candidate_points[: None if settings.check_reverse else 0]
     if constraint is not None:
