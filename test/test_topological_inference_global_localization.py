@@ -31,6 +31,7 @@ from hmt_slam_ros.topological_inference.global_localization import (
     continue_search,
     is_conclusive,
     localize_globally,
+    plausible_areas,
     search_region,
     summarize_localization,
 )
@@ -186,7 +187,6 @@ def test_an_event_searches_the_most_probable_regions_until_its_work_is_done():
     assert matcher.searched == matcher.prepared == [1, 3, 4, 5]
     assert matcher.best_shares == [0.0, 0.0, 0.6, 0.6]
     assert list(search.unexamined) == [0]
-    assert search.fitting_areas == {1, 2, 3, 4, 5, 6}
     assert [candidate.area for candidate in search.candidates] == [1, 3, 4, 5]
     assert next_event(search, matcher, hybrid_map).unexamined == {}
 
@@ -316,3 +316,15 @@ def test_only_areas_near_an_initial_pose_are_searched(x, y, near):
     areas = dict.fromkeys(range(3), 1.0 / 3.0)
     search = begin_search(hybrid_map, {9: np.zeros(3)}, 9, areas, pose_hint, 2.0)
     assert (list(search.unexamined), search.areas) == (near, len(near))
+
+
+def test_areas_are_plausible_where_a_candidate_is_and_around_if_the_keyframes_are_in_the_map():
+    hybrid_map = map_of(6)
+    for area, x in ((1, 4.0), (3, 40.0)):
+        hybrid_map.set_arc(2, area, PoseGaussian(np.array([x, 0.0, 0.0]), 0.01 * np.eye(3)), closure=False)
+    candidates = tuple(map(make_candidate, (2, 4, 5)))
+    found = PoseDistribution(candidates, np.array([0.7, 0.0008, 0.0006]))
+    assert plausible_areas(found, hybrid_map, 3.0) == {1, 2, 4}
+    doubted = PoseDistribution(candidates, np.array([0.4, 0.05, 0.04]))
+    assert plausible_areas(doubted, hybrid_map, 3.0) == frozenset()
+    assert plausible_areas(PoseDistribution((), np.zeros(0)), hybrid_map, 3.0) == frozenset()

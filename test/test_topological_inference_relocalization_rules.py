@@ -145,24 +145,25 @@ class GivenSearch(SimpleNamespace):
     """Branching whose search finds a distribution that is given, after some events."""
 
     def __init__(self, events=1, **given):
-        super().__init__(first_areas=[], remaining=events, **given)
+        super().__init__(first_areas=[], remaining=events, unexamined={}, **given)
         self.search = SimpleNamespace(
             work=EventWork(),
             check_candidates=lambda _map, search, _clutter, _hint=None: (search, True),
             begin_global_search=self.begin,
             continue_global_search=self.go_on,
             search_now=lambda hybrid_map, search, area, _clutter: self.go_on(hybrid_map, search, area),
+            plausible_areas=lambda _map, _found: frozenset({1, 2}),
             is_conclusive=lambda _map, _search, _clutter, _hint=None: self.remaining == 0,
         )
 
     def begin(self, _hybrid_map, poses, before, hint=None, only=()):
         self.requested, self.only = (poses, before, hint), only
-        return GlobalSearch(poses, before, 3, {}, self.found.candidates, frozenset({1, 2}))
+        return GlobalSearch(poses, before, 3, dict(self.unexamined), self.found.candidates)
 
     def go_on(self, _hybrid_map, search, first=None):
         self.first_areas.append(first)
         self.remaining -= 1
-        return search
+        return search if self.remaining else replace(search, unexamined={})
 
     def localize_globally(self, _parent, search, hint=None):
         assert search.poses is self.requested[0]
@@ -195,6 +196,20 @@ def test_a_lost_robot_is_searched_by_its_keyframes_seen_from_the_first():
     assert child.state.localization.candidate is None
     other, _, _ = search(Lost(21, pose_hint=replace(hint, keyframe=9)))
     assert other.requested[2] is None
+
+
+def test_a_search_that_may_confirm_a_candidate_goes_through_all_areas_that_are_left_to_it():
+    lost = Lost(21, candidate=PoseInArea(1, 22, np.zeros(3)), plausible_areas=frozenset({1, 2}))
+    for before, events in ((lost, 2), (Lost(21), 1)):
+        branching, parent = GivenSearch(2, options=OPTIONS, found=distribution()), make_parent(before)
+        branching.search.is_conclusive = lambda *_: True
+        branching.unexamined = {2: 0.5}
+        for _ in range(events):
+            assert parent.state.localization.searched < 0
+            (child,) = relocalization.update_relocalization(branching, parent).children
+            parent = replace(parent, state=child.state)
+        if before is lost:
+            assert parent.state.localization.searched == 25
 
 
 def test_a_search_goes_on_with_its_keyframes_until_it_is_over():

@@ -87,6 +87,11 @@ def test_while_a_comparison_goes_on_each_hypothesis_is_first_in_turn():
     assert order == [[0, 1, 2], [1, 2, 0], [2, 0, 1]]
 
 
+def test_a_lost_robot_is_searched_under_the_most_probable_hypothesis_first():
+    parents = [replace(make_parent(n, localization=Lost(3)), log_weight=w) for n, w in enumerate((-3.0, -0.1, -2.0))]
+    assert [parent.hypothesis for parent in module._in_turn(parents, 7)] == [1, 2, 0]
+
+
 def test_a_move_waits_for_the_end_of_a_comparison():
     tsbi, ongoing, event = make_tsbi(), object(), AreaEvent(0, "moved", (), 3, 0.5)
     assert tsbi._branch_on_area_event(make_parent(comparison=ongoing), event) == ("compared", ongoing)

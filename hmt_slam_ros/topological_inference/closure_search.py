@@ -55,6 +55,7 @@ from hmt_slam_ros.topological_inference.global_localization import (
     continue_search,
     is_conclusive,
     localize_globally,
+    plausible_areas,
     search_region,
 )
 from hmt_slam_ros.topological_inference.global_scan_matching import (
@@ -416,6 +417,13 @@ class ClosureSearch:
         """
         prior = self._options.aliasing_prior
         return localize_globally(search, prior, hybrid_map, clutter, pose_hint)
+
+    def plausible_areas(self, hybrid_map: HybridMap, distribution: PoseDistribution) -> frozenset[int]:
+        """The areas in which the keyframes of a search may be, and those around; none where they may be anywhere.
+
+        More keyframes are searched there alone: they fit nowhere else, as fewer did not.
+        """
+        return plausible_areas(distribution, hybrid_map, self._options.local_reach)
 
     def end_global_localization(self) -> None:
         """Free the grids of the whole map, which take as much memory as a large building's submaps."""

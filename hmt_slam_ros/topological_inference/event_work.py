@@ -6,8 +6,8 @@ region or of an area's place, a match with it, a place where keyframes do not li
 
 from __future__ import annotations
 
-_MAX_WORK = 10_000_000
-"""Work after which an event begins no further step: samples looked up, about 15 ms."""
+_MAX_WORK = 20_000_000
+"""Work after which an event begins no further step: samples looked up, about 30 ms."""
 
 CELL_WORK = 50
 """Work of a cell of a map that is made: in the time of so many samples."""

@@ -20,7 +20,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
-from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions
+from hmt_slam_ros.hybrid_map.surroundings import areas_around, keyframe_positions
 from hmt_slam_ros.messages.messages import Notice
 from hmt_slam_ros.registration.consistency import (
     MAP_IN_MAP,
@@ -30,7 +30,11 @@ from hmt_slam_ros.registration.consistency import (
     Clutter,
 )
 from hmt_slam_ros.topological_inference.event_work import EventWork
-from hmt_slam_ros.topological_inference.global_scan_matching import GlobalScanMatcher, PoseCandidate
+from hmt_slam_ros.topological_inference.global_scan_matching import (
+    GlobalScanMatcher,
+    PoseCandidate,
+    region_neighborhood,
+)
 from hmt_slam_ros.topological_inference.place_recognition import PerceptualAliasing
 
 Pose = Float64
@@ -46,6 +50,12 @@ _MIN_WALL_CHECK_PROBABILITY = 0.05
 
 _OLD_MAP_FACTOR = 2.0
 """Ratio of the outlier rates of walls in an old map and in a recent one: people stood elsewhere."""
+
+_MIN_MAPPED_PROBABILITY = 0.5
+"""Smallest probability of all candidates with which keyframes are not searched elsewhere."""
+
+_MIN_PLAUSIBLE_RATIO = 1e-3
+"""Smallest ratio of the probabilities of a candidate and of the best with which its area is searched again."""
 
 _HINT_DEVIATIONS = 4.0
 """Deviations of a pose hint beyond which no area is searched."""
@@ -126,7 +136,6 @@ class GlobalSearch:
     :ivar areas: number of areas to search.
     :ivar unexamined: {area: probability by its appearance} of those that were not searched yet.
     :ivar candidates: what was found.
-    :ivar fitting_areas: the areas of the candidates' regions, and those around: a robot drives on.
     :ivar refuted: number of the candidates that were tested in vain.
     :ivar prepared: the area whose region's map was made at an earlier step, and which is matched next; else None.
     :ivar is_map_missing: whether something fits in the next region, or is expected to, so that its whole map is made.
@@ -137,7 +146,6 @@ class GlobalSearch:
     areas: int
     unexamined: Mapping[int, float]
     candidates: tuple[PoseCandidate, ...] = ()
-    fitting_areas: frozenset[int] = frozenset()
     refuted: int = 0
     prepared: int | None = None
     is_map_missing: bool = False
@@ -233,7 +241,6 @@ def _step(
         search,
         unexamined={area: p for area, p in search.unexamined.items() if area not in region.own_areas},
         candidates=search.candidates + match.candidates,
-        fitting_areas=search.fitting_areas | (region.poses.keys() if match.candidates else frozenset()),
         prepared=None,
     )
 
@@ -287,6 +294,22 @@ def localize_globally(
             # Walls without violations add nothing to the surfaces, so they only count against a candidate.
             log_weights[n] += min(0.0, WALLS_OF_MAP.log_likelihood_ratio(candidate.walls, wall_rate))
     return PoseDistribution(search.candidates, _probabilities(log_weights, log_rest))
+
+
+def plausible_areas(distribution: PoseDistribution, hybrid_map: HybridMap, reach: float) -> frozenset[int]:
+    """The areas in which keyframes may be after a search, and those around, as a robot drives on.
+
+    None where they are probably on unmapped ground, or in what was not searched: then they may be anywhere.
+
+    :param reach: largest distance between keyframes of two areas of a region, m.
+    """
+    probabilities = distribution.probabilities
+    if float(probabilities.sum()) < _MIN_MAPPED_PROBABILITY:
+        return frozenset()
+    least = _MIN_PLAUSIBLE_RATIO * float(probabilities.max())
+    areas = {c.area for c, p in zip(distribution.candidates, probabilities, strict=True) if p >= least}
+    around = (areas_around(hybrid_map, area, region_neighborhood(reach)) for area in sorted(areas))
+    return frozenset().union(*around)
 
 
 def is_conclusive(

@@ -82,7 +82,7 @@ _MAX_MATCHES = 40
 _REGION_WORK = 2_000_000
 """Work to find the areas and the keyframes of a region."""
 
-_BEAM_WORK = 2500
+_BEAM_WORK = 700
 """Work of a beam that is tested on walls: it is drawn in a map, and followed through another one."""
 
 
@@ -265,7 +265,7 @@ class GlobalScanMatcher:
         """
         known = {
             keyframe: se2.compose(belief.mean, pose)
-            for area, belief in areas_around(hybrid_map, candidate.area, _region_neighborhood(self._reach)).items()
+            for area, belief in areas_around(hybrid_map, candidate.area, region_neighborhood(self._reach)).items()
             for keyframe, pose in hybrid_map.keyframes(area).items()
             if keyframe < before
         }
@@ -330,7 +330,7 @@ def region_around(
     :param unexamined: those of them that no other region searched.
     :param reach: largest distance between keyframes of two areas of a region, m; its map reaches as far beyond.
     """
-    around = areas_around(hybrid_map, reference, _region_neighborhood(reach))
+    around = areas_around(hybrid_map, reference, region_neighborhood(reach))
     poses = {other: belief.mean for other, belief in around.items() if other in known}
     positions = keyframe_positions(hybrid_map, reference)
     own_areas = {
@@ -341,7 +341,11 @@ def region_around(
     return Region(reference, poses, frozenset(own_areas))
 
 
-def _region_neighborhood(reach: float) -> Neighborhood:
+def region_neighborhood(reach: float) -> Neighborhood:
+    """What a region's map holds around an area.
+
+    :param reach: largest distance between keyframes of two areas of a region, m.
+    """
     return Neighborhood(_REGION_SIGMA, 2.0 * reach)
 
 

@@ -154,7 +154,8 @@ class Lost:
     :ivar false_alarm: the alternative to a kidnapping, in localization; else None.
     :ivar pose_hint: for one of the keyframes since then; else None.
     :ivar candidate: the pose that the last search found, if it did.
-    :ivar fitting_areas: the areas that fitted in that search; the next one confirms or refutes the candidate there.
+    :ivar plausible_areas: the areas in which the robot may be by that search, and those around; the next one is made
+        there. None for the whole map.
     :ivar tracked_pose: the pose at ``since`` without a kidnapping, in mapping; else None.
     :ivar search: of the map, while it goes on; else None.
     :ivar searched: the newest keyframe of the last search, -1 before the first.
@@ -168,7 +169,7 @@ class Lost:
     false_alarm: FalseAlarm | None = None
     pose_hint: PoseHint | None = None
     candidate: PoseInArea | None = None
-    fitting_areas: frozenset[int] = frozenset()
+    plausible_areas: frozenset[int] = frozenset()
     tracked_pose: PoseInArea | None = None
     search: GlobalSearch | None = None
     searched: int = -1

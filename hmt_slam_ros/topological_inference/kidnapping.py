@@ -104,8 +104,8 @@ def _kidnapped_child(branching: Branching, parent: Parent, keyframes: Sequence[i
     lost = Lost(keyframes[0], tracked_pose=tracked_pose, counted_evidence=evidence)
     if branching.search.is_conclusive(parent.hybrid_map, search, parent.clutter):
         candidate = decisive_candidate(distribution, query.poses, branching.options)
-        fitting_areas = frozenset() if candidate is None else search.fitting_areas
-        lost = replace(lost, candidate=candidate, fitting_areas=fitting_areas, searched=max(query.poses))
+        plausible = branching.search.plausible_areas(parent.hybrid_map, distribution)
+        lost = replace(lost, candidate=candidate, plausible_areas=plausible, searched=max(query.poses))
     else:
         lost = replace(lost, search=search)
     state = replace(child.state.without_kidnapping_evidence(), surroundings=Surroundings(), localization=lost)

@@ -119,7 +119,7 @@ def _relocalize_at_hint(
     newest = max(keyframes)
     scan_T_newest = PoseGaussian.from_pose(se2.between(pose, keyframes[newest]))
     hint = PoseHint(newest, initial_pose.area, initial_pose.pose.compose(scan_T_newest))
-    lost = replace(lost, pose_hint=hint, false_alarm=None, search=None, fitting_areas=frozenset(), unknown=-1)
+    lost = replace(lost, pose_hint=hint, false_alarm=None, search=None, plausible_areas=frozenset(), unknown=-1)
     hinted = _with_localization(parent, lost)
     branches = update_relocalization(branching, hinted)
     arcs = _hinted_arcs(parent, lost.since, hint, keyframes[newest])
@@ -192,6 +192,9 @@ def update_relocalization(branching: Branching, parent: Parent) -> Branches:
 
 
 def _is_conclusive(branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch) -> bool:
+    """Whether the search is over; one that may confirm a candidate goes through all areas that are left to it."""
+    if lost.candidate is not None and search.unexamined:
+        return False
     hint = _hint_of_first(lost, search.poses)
     return branching.search.is_conclusive(parent.hybrid_map, search, parent.clutter, hint)
 
@@ -207,7 +210,7 @@ def _begin_search(branching: Branching, parent: Parent, lost: Lost) -> GlobalSea
     reference = next(iter(keyframes.values()))
     poses = {k: se2.between(reference, pose) for k, pose in keyframes.items()}
     hint = _hint_of_first(lost, poses)
-    return branching.search.begin_global_search(parent.hybrid_map, poses, lost.since, hint, lost.fitting_areas)
+    return branching.search.begin_global_search(parent.hybrid_map, poses, lost.since, hint, lost.plausible_areas)
 
 
 def _conclude_search(
@@ -231,11 +234,14 @@ def _conclude_search(
     lost = _after_refutation(lost, distribution, poses)
     best = distribution.best
     if best is None or not _is_decisive(*best, branching.options, is_kidnapped=is_kidnapped):
-        children = [_child_with_localization(parent, replace(lost, candidate=None, fitting_areas=frozenset()))]
+        plausible = branching.search.plausible_areas(parent.hybrid_map, distribution)
+        children = [_child_with_localization(parent, replace(lost, candidate=None, plausible_areas=plausible))]
         return Branches(children, True, pose_distribution=distribution)
     candidate, probability = best
     with_candidate = replace(
-        lost, candidate=_pose_in_area(candidate, poses, max(poses)), fitting_areas=search.fitting_areas
+        lost,
+        candidate=_pose_in_area(candidate, poses, max(poses)),
+        plausible_areas=branching.search.plausible_areas(parent.hybrid_map, distribution),
     )
     if (hint is not None and probability >= branching.options.hint_probability) or _confirms_candidate(
         parent.hybrid_map, lost, candidate, poses

@@ -423,8 +423,12 @@ class Tsbi:
 
 
 def _in_turn(parents: Sequence[Parent], sequence: int) -> Sequence[Parent]:
-    """The order in which hypotheses use the work of an event: while a comparison goes on, each is first in turn."""
+    """The order in which hypotheses use the work of an event.
+
+    While a comparison goes on, each is first in turn. A lost robot is searched for the most probable one first.
+    """
     if all(parent.state.comparison is None for parent in parents):
-        return parents
+        is_lost = any(parent.state.is_lost for parent in parents)
+        return sorted(parents, key=lambda parent: -parent.log_weight) if is_lost else parents
     first = sequence % len(parents)
     return [*parents[first:], *parents[:first]]
