@@ -18,7 +18,7 @@ import pytest
 from logs_for_nodes import corridor_bag, is_alive
 from preloaded import hmt_slam
 
-from hmt_slam_ros.configuration import Configuration, load_configuration
+from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.evaluation import read_tum
 from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.open_log import open_log
@@ -130,22 +130,16 @@ def test_the_nodes_correct_scans_for_the_motion_during_their_sweeps_as_the_lock_
         assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
 
 
-def test_the_nodes_have_two_areas_become_one_as_the_lock_step_run_does(map_twice):
-    nodes, lock_step = map_twice("sim:grid,seed=4,count=2", "robot.duration=110.0")
-    table = np.genfromtxt(nodes / "pmf.csv", delimiter=",", names=True, usecols=("keyframe", "areas"))
-    assert np.diff(table["areas"]).min() < 0
-    for name in ("trajectory.tum", "trajectory_online.tum", "pmf.csv", "hmt_map/map.json", "hmt_map/map.bin"):
-        assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
-
-
-def test_the_nodes_forget_the_keyframes_that_the_lock_step_run_forgets(map_twice):
-    name = "sim:office,size=0.7,rate=1.5,laps=2"
-    log, run = open_log(name), LockStepRun(Configuration())
-    for record in log.records():
+def test_the_nodes_have_two_areas_become_one_and_forget_keyframes_as_the_lock_step_run_does(map_twice):
+    name, settings = "sim:grid,size=0.7,rate=1,laps=2", ("robot.duration=250.0", "aam.keyframes_per_place=1")
+    run = LockStepRun(load_configuration(settings=settings))
+    for record in open_log(name, duration=250.0).records():
         run.process_record(record)
     gone = {one.keyframe for answer in run.recorder.hypotheses.values() for one in answer.pruned_keyframes}
     assert len(gone) > 3
-    nodes, lock_step = map_twice(name)
+    nodes, lock_step = map_twice(name, *settings)
+    table = np.genfromtxt(nodes / "pmf.csv", delimiter=",", names=True, usecols=("keyframe", "areas"))
+    assert np.diff(table["areas"]).min() < 0
     assert not gone & read_saved_map(nodes / "hmt_map").replica.scans.keys()
     for file in ("trajectory.tum", "trajectory_online.tum", "pmf.csv", "hmt_map/map.json", "hmt_map/map.bin"):
         assert (nodes / file).read_bytes() == (lock_step / file).read_bytes()
