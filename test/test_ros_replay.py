@@ -5,7 +5,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -19,6 +18,7 @@ from logs_for_nodes import corridor_bag, is_alive
 from preloaded import hmt_slam
 
 from hmt_slam_ros.configuration import load_configuration
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import read_tum
 from hmt_slam_ros.offline.runtime import LockStepRun
 from hmt_slam_ros.open_log import open_log
@@ -228,26 +228,16 @@ def test_a_run_that_is_killed_takes_its_nodes_with_it(running):
     wait_until(lambda: not any(is_alive(pid) for pid in nodes.values()))
 
 
-def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path):
-    script = (
-        "import sys\n"
-        "from pathlib import Path\n"
-        "from hmt_slam_ros.configuration import load_configuration\n"
-        "from hmt_slam_ros.errors import HmtSlamError\n"
-        "from hmt_slam_ros.ros.replay import replay\n"
-        "try:\n"
-        f"    replay(Path({str(corridor_bag(tmp_path, 200))!r}), Path({str(tmp_path / 'out')!r}),\n"
-        "           load_configuration(settings=['robot.rate=1.0']), stall_timeout=15.0)\n"
-        "except HmtSlamError as error:\n"
-        "    sys.exit(str(error))\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    wait_until(lambda: "aam" in children_of(process.pid) or process.poll() is not None)
-    os.kill(children_of(process.pid)["aam"], signal.SIGSTOP)
-    error = process.communicate(timeout=100)[1]
-    assert process.returncode == 1
-    assert "the run waits for the node aam" in error
-    assert not (tmp_path / "out").exists()
+def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path, preloaded_nodes):
+    log, out = corridor_bag(tmp_path, 200), tmp_path / "out"
+
+    def stop(_):
+        os.kill(preloaded_nodes["aam"], signal.SIGSTOP)
+
+    with pytest.raises(HmtSlamError, match="the run waits for the node aam"):
+        replay(log, out, load_configuration(settings=["robot.rate=1.0"]), stop, stall_timeout=10.0)
+    assert not out.exists()
+    assert not any(is_alive(pid) for pid in preloaded_nodes.values())
 
 
 def test_the_live_page_of_a_run_is_served_while_it_lasts_though_it_is_killed_unless_its_port_is_taken(tmp_path):
