@@ -285,7 +285,6 @@ class SlamNode(MapServicesNode):
         ):
             super().deliver(PoseReset())
         super().deliver(message)
-        self._publish_early_estimates()
         if self._end_status is not None:
             self._end_log_if_complete()
         self._saver.start_if_ready()
@@ -383,7 +382,7 @@ class SlamNode(MapServicesNode):
             self._end_log_if_complete(force=True)
 
     def publish_views(self, message: Message, outputs: list[Message]) -> None:
-        """Publish the particles of the most probable hypothesis in the map, at keyframes."""
+        """Publish early estimates, and at keyframes the particles of the most probable hypothesis in the map."""
         if isinstance(message, ClosureDecision) and message.global_poses:
             self._area_poses = {entry.area: entry for entry in message.global_poses}
         for output in outputs:
@@ -395,6 +394,7 @@ class SlamNode(MapServicesNode):
             if isinstance(output, Keyframe):
                 self._report_particles(output)
                 self._publish_particles(output.scan.stamp)
+        self._publish_early_estimates()
 
     def _report_particles(self, keyframe: Keyframe) -> None:
         best = self.process.replica.best_hypothesis
