@@ -28,6 +28,7 @@ from hmt_slam_ros.messages.documents import (
 from hmt_slam_ros.messages.messages import (
     AreaEvents,
     ClosureDecision,
+    EarlyEstimate,
     Hypotheses,
     HypothesisEstimate,
     Keyframe,
@@ -46,6 +47,7 @@ KINDS = (
     Hypotheses,
     ClosureDecision,
     LocalEstimate,
+    EarlyEstimate,
     TrackingReset,
     Notice,
     FinalCounts,
