@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,8 +17,6 @@ import pytest
 from logs_for_nodes import corridor_bag, is_alive
 from preloaded import hmt_slam
 
-from hmt_slam_ros.cli.arguments import build_parser
-from hmt_slam_ros.cli.run_commands import run_replay
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import read_tum
@@ -243,50 +240,41 @@ def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path, preloaded
     assert not any(is_alive(pid) for pid in preloaded_nodes.values())
 
 
-def test_the_live_page_of_a_run_is_served_while_it_lasts_though_it_is_killed_unless_its_port_is_taken(
-    tmp_path, preloaded_nodes, capfd
-):
-    def run():
-        run_replay(build_parser().parse_args(["replay", str(log), "--out", str(out), *settings]))
-
+def test_the_live_page_of_a_run_is_served_while_it_lasts_though_it_is_killed_unless_its_port_is_taken(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        log, out = corridor_bag(tmp_path, 120), tmp_path / "out"
-        settings = ("--set", "robot.rate=4", "--view", str(port))
-        with pytest.raises(HmtSlamError, match=f"the page cannot listen on 127.0.0.1, port {port}"):
-            run()
-    preloaded_nodes.clear()
+        log, out = corridor_bag(tmp_path, 200), tmp_path / "out"
+        words = ("replay", log, "--out", out, "--set", "robot.rate=4", "--view", port)
+        done = hmt_slam(*words, timeout=60.0)
+    assert done.returncode == 2
+    assert f"the page cannot listen on 127.0.0.1, port {port}" in done.stderr.splitlines()[-1]
 
-    def read_screen():
-        assert not out.exists()
-        with suppress(OSError), urlopen(url + "snapshot.json", timeout=5) as answer:
-            return json.load(answer)
-        return {}
+    outputs = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with preloaded.start(preloaded.COMMAND, *words, cwd=ROOT, **outputs) as process:
+        url = process.stderr.readline().split()[-1]
 
-    def received_of(name):
-        rows = read_screen().get("nodes", ())
-        return next((row["message"] for row in rows if row["name"] == name), "not heard yet")
+        def read_screen():
+            assert process.poll() is None
+            with suppress(OSError), urlopen(url + "snapshot.json", timeout=5) as answer:
+                return json.load(answer)
+            return {}
 
-    def watch():
-        """Kill the page while the robot stands still, and look at the one that is started again."""
+        def received_of(name):
+            rows = read_screen().get("nodes", ())
+            return next((row["message"] for row in rows if row["name"] == name), "not heard yet")
+
         wait_until(lambda: "robot" in read_screen())
-        os.kill(preloaded_nodes["robot"], signal.SIGSTOP)
-        killed = preloaded_nodes["view"]
-        os.kill(killed, signal.SIGKILL)
-        wait_until(lambda: preloaded_nodes["view"] != killed)
+        nodes = children_of(process.pid)
+        os.kill(nodes["robot"], signal.SIGSTOP)
+        os.kill(nodes["view"], signal.SIGKILL)
+        wait_until(lambda: nodes["view"] not in children_of(process.pid).values())
         wait_until(lambda: received_of("rtl") != "not heard yet")
-        os.kill(preloaded_nodes["robot"], signal.SIGCONT)
+        os.kill(nodes["robot"], signal.SIGCONT)
         wait_until(lambda: "robot" in read_screen())
-
-    url = f"http://127.0.0.1:{port}/"
-    with ThreadPoolExecutor() as pool:
-        watching = pool.submit(watch)
-        run()
-        watching.result()
-    error = capfd.readouterr().err
-    assert f"the live page is at {url}" in error
+        error = process.communicate(timeout=60)[1]
+    assert process.returncode == 0
     assert "the node view was killed by signal 9: it is started again" in error
-    assert set(json.loads((out / "report.json").read_text())["peak_rss_bytes"]) == NODES
+    assert set(json.loads((tmp_path / "out" / "report.json").read_text())["peak_rss_bytes"]) == NODES
     with pytest.raises(OSError, match="refused"):
         urlopen(url, timeout=5)
 
