@@ -247,10 +247,10 @@ def _convert_to_log_ratio(fine: Float32, free: Bool, sigma: float, surface_ratio
     Free space counts in full from two or three sigma on: beams that graze a wall see free space right up to it, and
     unequal flanks would pull a match away from the wall.
     """
-    log_free, far, half = np.log(free_ratio), np.float32(14.0 * sigma**2), fine.shape[0] // free.shape[0] - 1
+    log_free, far, shift = np.log(free_ratio), np.float32(14.0 * sigma**2), fine.shape[0] // free.shape[0] - 1
     for r in range(fine.shape[0]):
         for c in range(fine.shape[1]):
-            is_free = free[r >> half, c >> half]
+            is_free = free[r >> shift, c >> shift]
             if fine[r, c] > far and not is_free:
                 fine[r, c] = 0.0
                 continue
