@@ -72,6 +72,11 @@ class UnboundedWork(EventWork):
         """False."""
         return False
 
+    @property
+    def admits_comparison(self) -> bool:
+        """True."""
+        return True
+
 
 class Script:
     """Sends keyframe events to TSBI.

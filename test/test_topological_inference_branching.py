@@ -294,7 +294,7 @@ def test_further_ways_to_fit_into_an_area_count_as_not_examined():
 
 
 def test_an_improbable_hypothesis_examines_few_areas_and_counts_the_others(monkeypatch):
-    monkeypatch.setattr(event_work, "_MAX_WORK", 10**12)
+    monkeypatch.setattr(event_work, "_MAX_COMPARISON_WORK", 10**12)
     offsets = [(0.5 * k - 1.2, 0.3 * (k % 3) - 0.3) for k in range(6)]
     parent, branching, newest = rooms_apart((ROOM,) * 7, offsets, 1.0)
     examined = {}

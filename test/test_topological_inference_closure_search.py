@@ -96,7 +96,7 @@ def works(monkeypatch):
 def test_a_wide_comparison_is_spread_over_events_with_the_result_of_a_single_one(lattice, works, monkeypatch):
     """Maps and matches of areas, and of the places where the keyframes do not lie, are steps of their own."""
     keyframes = query(lattice)
-    monkeypatch.setattr(event_work, "_MAX_WORK", 10**15)
+    monkeypatch.setattr(event_work, "_MAX_COMPARISON_WORK", 10**15)
     search = ClosureSearch(Configuration(), LatticeScans())
     comparison = begin(search, lattice, keyframes)
     at_once, states = finish(search, lattice, comparison)
@@ -106,7 +106,7 @@ def test_a_wide_comparison_is_spread_over_events_with_the_result_of_a_single_one
     total, alone = sum(works), search.state
     works.clear()
     budget = total // 8
-    monkeypatch.setattr(event_work, "_MAX_WORK", budget)
+    monkeypatch.setattr(event_work, "_MAX_COMPARISON_WORK", budget)
     search = ClosureSearch(Configuration(), LatticeScans())
     comparison, left, before = begin(search, lattice, keyframes), [], 0
     while not isinstance(comparison, AreaComparison):
@@ -129,7 +129,7 @@ def test_a_wide_comparison_is_spread_over_events_with_the_result_of_a_single_one
 
 def test_the_hypotheses_of_an_event_share_its_work(lattice, works, monkeypatch):
     search, keyframes = ClosureSearch(Configuration(), LatticeScans()), query(lattice)
-    monkeypatch.setattr(event_work, "_MAX_WORK", 1)
+    monkeypatch.setattr(event_work, "_MAX_COMPARISON_WORK", 1)
     first, second = (begin(search, lattice, keyframes) for _ in range(2))
     search.work.begin_event()
     first = search.continue_comparison(lattice, first)
@@ -140,7 +140,7 @@ def test_the_hypotheses_of_an_event_share_its_work(lattice, works, monkeypatch):
 
 
 def test_places_where_keyframes_do_not_lie_are_matched_for_one_of_two_hypotheses(lattice, monkeypatch):
-    monkeypatch.setattr(event_work, "_MAX_WORK", 1)
+    monkeypatch.setattr(event_work, "_MAX_COMPARISON_WORK", 1)
     search, keyframes = ClosureSearch(Configuration(), LatticeScans()), query(lattice)
     _, states = finish(search, lattice, begin(search, lattice, keyframes))
     shares = search.state.negative_shares
@@ -151,7 +151,7 @@ def test_places_where_keyframes_do_not_lie_are_matched_for_one_of_two_hypotheses
 
 
 def test_a_comparison_goes_on_the_same_without_the_maps_that_were_made(lattice, monkeypatch):
-    monkeypatch.setattr(event_work, "_MAX_WORK", 1)
+    monkeypatch.setattr(event_work, "_MAX_COMPARISON_WORK", 1)
     found = []
     for is_resumed in (False, True):
         search = ClosureSearch(Configuration(), LatticeScans())

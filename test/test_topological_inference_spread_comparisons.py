@@ -25,7 +25,7 @@ WORLD = "sim:ring,seed=1,size=0.7"
 @pytest.fixture(autouse=True)
 def _small_budget(monkeypatch):
     """Let an event make the map of one area at most, or compare keyframes with it."""
-    monkeypatch.setattr(event_work, "_MAX_WORK", 1)
+    monkeypatch.setattr(event_work, "_MAX_COMPARISON_WORK", 1)
 
 
 def newest_hypotheses(run):

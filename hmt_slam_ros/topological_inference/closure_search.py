@@ -270,7 +270,7 @@ class ClosureSearch:
             examined=tuple(one for one in comparison.examined if hybrid_map.has_area(one.area)),
             elsewhere=tuple(area for area in comparison.elsewhere if hybrid_map.has_area(area)),
         )
-        while (area := self._next_area(comparison)) is not None and not self.work.is_exhausted:
+        while (area := self._next_area(comparison)) is not None and self.work.admits_comparison:
             if comparison.prepared != area:
                 self._grid_cache.place(hybrid_map, area, comparison.excluded)
                 comparison = replace(comparison, prepared=area)

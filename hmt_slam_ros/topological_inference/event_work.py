@@ -7,7 +7,10 @@ region or of an area's place, a match with it, a place where keyframes do not li
 from __future__ import annotations
 
 _MAX_WORK = 20_000_000
-"""Work after which an event begins no further step: samples looked up, about 30 ms."""
+"""Work after which an event begins no further step of a search: samples looked up, about 30 ms."""
+
+_MAX_COMPARISON_WORK = 10_000_000
+"""Work after which an event begins no further step of a comparison. A comparison can wait; a lost robot drives on."""
 
 CELL_WORK = 50
 """Work of a cell of a map that is made: in the time of so many samples."""
@@ -32,5 +35,10 @@ class EventWork:
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether the work of the event is done, after which no other step begins."""
+        """Whether the work of the event is done, after which no further step begins."""
         return self.done >= _MAX_WORK
+
+    @property
+    def admits_comparison(self) -> bool:
+        """Whether a further step of a comparison may begin."""
+        return self.done < _MAX_COMPARISON_WORK
