@@ -1,4 +1,4 @@
-"""Early estimates of scans that wait for an answer: there at once, near the truth, and without effect on the rest."""
+"""Early estimates of scans that wait: there at once, near the truth, and without effect on the rest."""
 
 import pickle
 from collections import deque
@@ -88,6 +88,24 @@ def test_a_scan_whose_odometry_is_not_known_waits():
     assert dialogue.early == []
     dialogue.send(later)
     assert [estimate.scan_index for estimate in dialogue.early] == [1]
+
+
+def test_scans_that_wait_for_later_odometry_have_estimates_at_once():
+    ahead, plain, frozen = Waiting(), Dialogue(), range(20, 35)
+    ahead.answer = agree
+    for number, (odometry, scan, pose) in enumerate(drive(50)):
+        reading = replace(odometry, pose=np.array([1.9, 0.0, 0.0])) if number in frozen else odometry
+        ahead.send(reading, scan)
+        plain.send(reading, scan)
+        if number in frozen:
+            assert ahead.slam.queued_scans == number - frozen[0] + 1
+            estimate = ahead.early[-1]
+            assert (estimate.stamp, estimate.scan_index) == (scan.stamp, number)
+            assert np.hypot(*se2.between(pose, estimate.pose.mean)[:2]) < 0.1
+    assert len(ahead.early) == len(frozen)
+    assert len(ahead.messages_of(LocalEstimate)) == 50
+    assert pickle.dumps(ahead.slam.state) == pickle.dumps(plain.slam.state)
+    assert pickle.dumps(ahead.answers) == pickle.dumps(plain.answers)
 
 
 def test_it_goes_on_in_the_area_of_the_hypotheses_until_the_decision():

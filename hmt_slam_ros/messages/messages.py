@@ -235,12 +235,12 @@ class LocalEstimate:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class EarlyEstimate:
-    """slam -> rtl: estimate of a scan that waits for the answer to a keyframe event; its ``LocalEstimate`` follows.
+    """slam -> rtl: estimate of a scan that waits for topology or for later odometry; its ``LocalEstimate`` follows.
 
     :ivar stamp: stamp of the scan, ns.
     :ivar scan_index: as in ``LocalEstimate``; not all scans have an early estimate.
-    :ivar event: the keyframe event.
-    :ivar area: area of the hypothesis that was the most probable at the event.
+    :ivar event: the last keyframe event.
+    :ivar area: area of the hypothesis that is the most probable.
     :ivar pose: belief over ``area_T_base`` at the scan.
     :ivar odometry: shape (3,), ``odom_T_base`` at the scan.
     """

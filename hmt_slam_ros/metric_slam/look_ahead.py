@@ -1,8 +1,8 @@
-"""Early estimates: where the robot is at scans that wait for the answer to a keyframe event.
+"""Early estimates: where the robot is at scans that wait for the answer to a keyframe event, or for later odometry.
 
-Nobody waits for topology: such a scan is matched with the map of the last event, on a copy of the most probable
-hypothesis's filter. The copy is dropped when the answer comes, and metric SLAM works the scans off as in lock-step. So
-no decision depends on early estimates, nor on when an answer comes.
+Nobody waits for these: such a scan is matched with the map of the last event, on a copy of the most probable
+hypothesis's filter. The copy is dropped when metric SLAM goes on, which works the scans off as in lock-step. So no
+decision depends on early estimates, nor on when an answer comes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 
 
 class LookAhead:
-    """Tracks the robot through waiting scans, from one keyframe event on until its answer.
+    """Tracks the robot through waiting scans, from the last estimate on until the next.
 
     Of several scans that have no estimate at the first call only the newest gets one: however many wait, the robot's
     pose is known at once.
@@ -44,7 +44,7 @@ class LookAhead:
 
         :param live: the most probable hypothesis; its filter does not change meanwhile.
         :param motion: of metric SLAM.
-        :param event: the keyframe event.
+        :param event: the last keyframe event.
         :param next_scan: number of the first scan that may have an estimate.
         """
         self._limits, self._mapping, self._event = configuration.rtl, mapping, event
@@ -65,8 +65,8 @@ class LookAhead:
         begin = max(first, self.next_scan, 0 if self._has_begun else first + len(scans) - 1)
         estimates = []
         for number, scan in enumerate(scans[begin - first :], begin):
-            if self._motion.settle_odometry(scan.stamp) is None:
-                break
+            # Whether odometry is stale may show later; the match counts until then.
+            self._motion.settle_odometry(scan.stamp)
             estimates.append(self._track(number, scan))
             self.next_scan, self._has_begun = number + 1, True
         return estimates

@@ -250,14 +250,15 @@ class MetricSlam:
         return self._process_queue()
 
     def look_ahead(self) -> list[EarlyEstimate]:
-        """Estimates of the scans that wait for the answer to a keyframe event, as far as they have none yet.
+        """Estimates of the scans that wait, as far as they have none yet.
 
+        They wait for the answer to a keyframe event, or until later odometry shows whether that before was stale.
         Results are the same without them.
         """
-        if not self._state.awaiting_decision or self._state.reset_pending:
+        if self._state.reset_pending:
             return []
         scans = self._scan_queue.ready_scans()
-        if self._state.processed_scans + len(scans) <= self._next_early:
+        if not scans or self._state.processed_scans + len(scans) <= self._next_early:
             return []
         ahead = self._look_ahead or LookAhead(
             self._configuration,
@@ -295,6 +296,7 @@ class MetricSlam:
         return [TrackingReset(self._state.keyframe_events, self._state.processed_scans)]
 
     def _process_scan(self, scan: Scan) -> list[Message]:
+        self._look_ahead = None  # whose filter goes on
         prediction = self._motion.predict(scan.stamp)
         prepared = PreparedScan(self._mapping, deskew_scan(scan, self._motion.odometry, self._configuration.rtl))
         messages: list[Message] = []
