@@ -63,6 +63,17 @@ def deviations(step, truth):
     return np.sqrt(difference @ np.linalg.solve(step.covariance, difference))
 
 
+def test_of_readings_that_wait_for_hours_fewer_are_kept_and_no_motion_is_lost():
+    buffer, period = OdometryBuffer(), 10_000_000
+    for k in range(1_000_000):
+        buffer.add(Odometry(k * period, np.array([0.01 * k, 0.0, 0.0])))
+    readings = buffer.readings
+    assert 5_000 <= len(readings) <= 10_000
+    assert (readings[0].stamp, readings[-1].stamp) == (0, 999_999 * period)
+    pose, _ = buffer.pose_at(654_321 * period)
+    assert pose == pytest.approx([6543.21, 0.0, 0.0])
+
+
 def test_a_steady_velocity_is_learnt():
     prediction, truth = drive_steadily(Inertia(MotionParameters()), TURNING, 0.2 * np.arange(20))
     np.testing.assert_allclose(prediction.increment, truth, atol=0.01)

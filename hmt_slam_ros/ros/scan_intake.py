@@ -18,9 +18,14 @@ from hmt_slam_ros.ros.topics import SCAN
 from hmt_slam_ros.sensors import Scan
 
 _LIVE_QUEUE = 200
-"""Scans in the queue of a live laser above which new ones are dropped; a replay never drops any."""
+"""Scans of a live laser that wait at most; each quarter of them halves the rate at which more are accepted."""
 _MAX_WAITING = 10_000
-"""Scans that wait for a transform, above which new ones are dropped."""
+"""Scans of a reliable publisher, such as a replay, that wait at most; all are accepted until then."""
+_TOPOLOGY_BEHIND = (
+    "scans wait for topology, so that not all are accepted until it has caught up: drive slower, and see /diagnostics "
+    "for the node whose load is high"
+)
+_SLAM_BEHIND = "scans come faster than they can be worked off, so that not all are accepted: lower filter.particles"
 _TRANSFORM_TIMEOUT = 3.0
 """Time for which the scans of an unknown frame hold up those of known ones, s."""
 _MAX_UNKNOWN_FRAMES = 4
@@ -54,6 +59,7 @@ class ScanIntake:
         self.last_scan_at = self._waiting_since = time.monotonic()
         self._waiting: deque[LaserScan] = deque()
         self._skipped: Scan | None = None
+        self._since_accepted = 0
         self._has_warned = False
         self._unknown_since: dict[str, float] = {}
         self._subscription = SensorSubscription(
@@ -112,19 +118,26 @@ class ScanIntake:
         """Let a scan wait until its laser's transform is known."""
         self.last_scan_at = time.monotonic()
         self.monitor.note_scan()
-        if self._subscription.is_best_effort and self._node.process.queued_scans + self.waiting_count >= _LIVE_QUEUE:
-            self._count_dropped(1)
-            self._node.diagnostics.warn(
-                "scans come faster than they can be worked off: some are dropped, lower filter.particles"
-            )
-            return
-        if self.waiting_count >= _MAX_WAITING:
+        if not self._is_accepted():
             self._count_dropped(1)
             return
         if not self._waiting:
             self._waiting_since, self._has_warned = time.monotonic(), False
         self._waiting.append(message)
         self._on_received()
+
+    def _is_accepted(self) -> bool:
+        """Whether a scan may wait beside those that do: the more wait the fewer are accepted, evenly spread."""
+        queued = self._node.process.queued_scans
+        waiting, is_live = queued + self.waiting_count, self._subscription.is_best_effort
+        spacing = 2 ** (4 * waiting // _LIVE_QUEUE) if is_live else 1
+        self._since_accepted += 1
+        if waiting < (_LIVE_QUEUE if is_live else _MAX_WAITING) and self._since_accepted >= spacing:
+            self._since_accepted = 0
+            return True
+        if queued > self.waiting_count:
+            self._node.diagnostics.warn(_TOPOLOGY_BEHIND if self._node.process.is_awaiting_decision else _SLAM_BEHIND)
+        return False
 
     def _count_dropped(self, count: int) -> None:
         self.dropped_count += count

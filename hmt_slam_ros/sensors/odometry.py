@@ -11,7 +11,7 @@ import math
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import takewhile
+from itertools import islice, takewhile
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.robot import RealTimeParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.sensors.scan import Scan
+
+_MAX_READINGS = 10_000
+"""Readings that wait for scans, above which every second one is left out; poses are absolute, so no motion is lost."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -54,6 +57,8 @@ class OdometryBuffer:
         """Append a reading; a reading whose stamp goes back starts a new sequence."""
         if self._readings and reading.stamp < self._readings[-1].stamp:
             self._readings.clear()
+        if len(self._readings) == _MAX_READINGS:
+            self._readings = deque(islice(self._readings, 0, None, 2))
         self._readings.append(reading)
 
     def poses_at(self, stamps: Iterable[int]) -> Iterator[Float64]:
