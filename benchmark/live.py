@@ -6,9 +6,10 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -23,7 +24,8 @@ from benchmark.report import Report, Requirement, table
 from benchmark.running_nodes import Listener
 from benchmark.settings import Settings
 from hmt_slam_ros.messages.documents import RobotStatus, decode
-from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.messages.messages import EarlyEstimate, LocalEstimate
+from hmt_slam_ros.metric_slam.look_ahead import EarlyEstimateRecord
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
@@ -34,17 +36,23 @@ PROCESSES = process_names()
 BUSY = "sim:office,rate=10,readings=10"
 """A drive with 100 odometry readings a second."""
 
-FAST = "sim:office,rate=40,readings=3,beams=1080,field_of_view=270"
-"""A drive with 40 scans a second of 1080 beams."""
+FAST = "sim:office,rate=40,readings=3,beams=1080,field_of_view=270,laps=3"
+"""Three laps of a building, in which loops close, with 40 scans a second of 1080 beams."""
 
-SECONDS = 60.0
-"""Duration of each drive, s."""
+SECONDS, FAST_SECONDS = 60.0, 600.0
+"""Durations of the drives, and of that with the fast laser, s."""
 
-LATENCY = 0.010
-"""Largest time from an odometry message to its pose, at 99 of 100, s."""
+LATENCY, SATURATED_LATENCY = 0.005, 0.010
+"""Largest time from an odometry message to its pose, at 99 of 100, s; and while all cores are busy."""
+
+SCAN_LATENCY, LARGEST_SCAN_LATENCY = 0.030, 0.100
+"""Largest time from a scan to its first estimate, early or not: at 99 of 100, and of all, s."""
 
 BEHIND = 0.5
 """Largest delay of metric SLAM at the end with the fast laser, s."""
+
+SLOW_TSBI = ("-m", "benchmark.slow_topology")
+"""Arguments of the Python interpreter that run a node of TSBI which takes a second for each event."""
 
 RATE = 10.0
 """Speed of replays relative to real time."""
@@ -55,14 +63,16 @@ LATER = 1.1
 _TIMEOUT = 3600.0
 
 POLICY = (
-    f"Every node is an OS process, and messages go over DDS. Saturated: a drive of {SECONDS:.0f} s with 100 odometry "
-    "readings a second in real time, with one process for every core that only computes. The latency is the time from "
-    "the publication of an odometry message to that of its pose, by the time stamps of DDS. Fast laser: "
-    f"{SECONDS:.0f} s with 40 scans a second of 1080 beams; the delay is that from a scan to metric SLAM's estimate. "
-    f"Replays: the logs at {RATE:g} times real time with flow control: the robot waits while 20 scans have no answer."
+    "Every node is an OS process, and messages go over DDS. Latencies are by the time stamps of DDS. Odometry to pose: "
+    f"{SECONDS:.0f} s with 100 odometry readings a second in real time; saturated: beside one process for every core "
+    "that only computes. Scan to estimate: to the first one, which is an early estimate where the scan waits for "
+    f"topology. Fast laser: {FAST_SECONDS:.0f} s with 40 scans a second of 1080 beams in a building with loops. Slow "
+    "topology: TSBI takes a second more for each keyframe event. Replays: the logs at "
+    f"{RATE:g} times real time with flow control: the robot waits while 20 scans have no answer."
 )
 
 Stamped = dict[int, float]
+Estimate = TypeVar("Estimate", EarlyEstimate, LocalEstimate)
 
 
 class MessageTimes(NamedTuple):
@@ -81,56 +91,110 @@ class MessageTimes(NamedTuple):
         return np.array([moment - self.sent[stamp] for stamp, moment in self.received.items() if stamp in self.sent])
 
 
+class ScanTimes(NamedTuple):
+    """Times of scans and of their estimates.
+
+    :ivar first: up to the first estimate of a scan, early or not.
+    :ivar final: up to the estimate of metric SLAM.
+    :ivar early: the early estimates against those of metric SLAM.
+    """
+
+    first: MessageTimes
+    final: MessageTimes
+    early: EarlyEstimateRecord
+
+
 def measure_live(settings: Settings) -> Report:
     """Measure the delays of the nodes, with drives and with replays."""
     report = Report("live", "Latency of the nodes")
-    poses, scans = measure_saturated(BUSY, SECONDS), measure_fast(FAST, SECONDS)
-    requirements = [
-        Requirement("odometry to pose, all else saturated, p99", float(np.quantile(poses.delays, 0.99)), LATENCY, "s"),
-        Requirement("odometry without a pose", count_unanswered(poses), 0),
-        Requirement("fast laser: scans without a pose", len(scans.sent) - len(scans.delays), 0),
-        Requirement("fast laser: delay at the end", float(scans.delays[-20:].mean()), BEHIND, "s"),
-    ]
-    rows = [_row("odometry to pose, saturated", poses.delays), _row("scan to pose, fast laser", scans.delays)]
+    poses = {"alone": measure_odometry(BUSY, SECONDS), "all else saturated": measure_saturated(BUSY, SECONDS)}
+    scans = {
+        "real time": measure_scans(BUSY, SECONDS),
+        "fast laser": measure_scans(FAST, FAST_SECONDS),
+        "slow topology": measure_scans(BUSY, SECONDS, SLOW_TSBI),
+    }
+    for name, limit in zip(poses, (LATENCY, SATURATED_LATENCY), strict=True):
+        report.requirements += [
+            Requirement(f"odometry to pose, {name}, p99", float(np.quantile(poses[name].delays, 0.99)), limit, "s"),
+            Requirement(f"{name}: odometry without a pose", count_unanswered(poses[name]), 0),
+        ]
+    for name, times in scans.items():
+        first = times.first.delays
+        report.requirements += [
+            Requirement(f"scan to estimate, {name}, p99", float(np.quantile(first, 0.99)), SCAN_LATENCY, "s"),
+            Requirement(f"scan to estimate, {name}, largest", float(first.max()), LARGEST_SCAN_LATENCY, "s"),
+            Requirement(f"{name}: scans without a pose", len(times.final.sent) - len(times.final.delays), 0),
+        ]
+    behind = float(scans["fast laser"].final.delays[-20:].mean())
+    report.requirements.append(Requirement("fast laser: delay at the end", behind, BEHIND, "s"))
+    rows = [_row(f"odometry to pose, {name}", times.delays) for name, times in poses.items()]
+    for name, times in scans.items():
+        rows.append(_row(f"scan to first estimate, {name}", times.first.delays))
+        rows.append(_row(f"scan to estimate of metric SLAM, {name}", times.final.delays))
+        report.body.append(f"Early estimates, {name}: {times.early}.")
     report.body.append(table(["", "messages", "median [ms]", "p99 [ms]", "largest [ms]"], rows))
     with open_logs(settings.logs_or(WITH_RELATIONS)) as logs:
         replays = {log.name: replay_log(str(log.path)) for log in logs}
     for name, replay in replays.items():
-        requirements.append(Requirement(f"{name}: scans lost", replay.scans - replay.answered_scans, 0))
-        requirements.append(Requirement(f"{name}: time / that of the log at {RATE:g} times", replay.time_ratio, LATER))
-    report.requirements += requirements
+        report.requirements += [
+            Requirement(f"{name}: scans lost", replay.scans - replay.answered_scans, 0),
+            Requirement(f"{name}: time / that of the log at {RATE:g} times", replay.time_ratio, LATER),
+        ]
     report.body += [_replay_table(replays), POLICY]
     report.data = {
-        "saturated": poses.delays.tolist(),
-        "fast": scans.delays.tolist(),
+        "odometry": {name: times.delays.tolist() for name, times in poses.items()},
+        "scans": {name: [one.delays.tolist() for one in (times.first, times.final)] for name, times in scans.items()},
         "replays": {name: replay._asdict() for name, replay in replays.items()},
     }
     return report
 
 
-def measure_saturated(log: str, seconds: float) -> MessageTimes:
-    """Times of odometry and poses, while all cores are busy."""
-    with _run_nodes() as listener, _saturate_cores():
+def measure_odometry(log: str, seconds: float) -> MessageTimes:
+    """Times of odometry and poses."""
+    with _run_nodes() as listener:
         sent = _collect_times(listener, Odometry, ODOM, topics.SENSOR)
         received = _collect_times(listener, PoseWithCovarianceStamped, POSE, topics.STREAM)
         _play_log(listener, log, seconds, ODOM)
         return MessageTimes(sent, received)
 
 
-def measure_fast(log: str, seconds: float) -> MessageTimes:
-    """Times of scans and estimates, with a fast laser."""
-    with _run_nodes() as listener:
+def measure_saturated(log: str, seconds: float) -> MessageTimes:
+    """Times of odometry and poses, while all cores are busy."""
+    with _saturate_cores():
+        return measure_odometry(log, seconds)
+
+
+def measure_scans(log: str, seconds: float, tsbi: Sequence[str] = ()) -> ScanTimes:
+    """Times of scans and estimates.
+
+    :param tsbi: arguments of the Python interpreter that run the node ``tsbi``; by default those of the package.
+    """
+    with _run_nodes({"tsbi": tsbi}) as listener:
         sent = _collect_times(listener, LaserScan, SCAN, topics.SENSOR)
-        received: Stamped = {}
-
-        def add_estimate(message: String, info: dict[str, int]) -> None:
-            estimate = decode(message.data, LocalEstimate)
-            received[estimate.stamp] = 1e-9 * info["source_timestamp"]
-
-        listener.node.create_subscription(String, DOCUMENTS[LocalEstimate], add_estimate, topics.CHAIN)
+        record = EarlyEstimateRecord()
+        early = _collect_estimates(listener, EarlyEstimate, record.add)
+        final = _collect_estimates(listener, LocalEstimate, record.compare)
         _play_log(listener, log, seconds, SCAN)
-        listener.wait_until(lambda: len(received) >= len(sent))
-        return MessageTimes(sent, received)
+        listener.wait_until(lambda: len(final) >= len(sent), _TIMEOUT)
+        first = {stamp: min(moment, early.get(stamp, moment)) for stamp, moment in final.items()}
+        return ScanTimes(MessageTimes(sent, first), MessageTimes(sent, final), record)
+
+
+def _collect_estimates(listener: Listener, kind: type[Estimate], add: Callable[[Estimate], None]) -> Stamped:
+    """A dictionary that collects {stamp of a scan: time at which its estimate was published, s}.
+
+    :param add: called with each estimate.
+    """
+    times: Stamped = {}
+
+    def add_time(message: String, info: dict[str, int]) -> None:
+        estimate = decode(message.data, kind)
+        times[estimate.stamp] = 1e-9 * info["source_timestamp"]
+        add(estimate)
+
+    profile = topics.CHAIN if kind is LocalEstimate else topics.STREAM
+    listener.node.create_subscription(String, DOCUMENTS[kind], add_time, profile)
+    return times
 
 
 class ReplayScores(NamedTuple):
@@ -180,12 +244,15 @@ def _replay_table(replays: dict[str, ReplayScores]) -> str:
 
 
 @contextmanager
-def _run_nodes() -> Iterator[Listener]:
-    """All five nodes as processes, with a listener."""
+def _run_nodes(commands: Mapping[str, Sequence[str]] = MappingProxyType({})) -> Iterator[Listener]:
+    """All five nodes as processes, with a listener.
+
+    :param commands: {node: arguments of the Python interpreter} of those that do not run as usual.
+    """
     with ExitStack() as stack:
         listener = stack.enter_context(Listener())
         for name in PROCESSES:
-            stack.enter_context(listener.running(name, {}))
+            stack.enter_context(listener.running(name, {}, commands.get(name, ())))
         yield listener
 
 

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -71,11 +71,16 @@ class Listener:
             self._executor.spin_once(timeout_sec=_SPIN)
 
     @contextmanager
-    def running(self, name: str, parameters: Parameters) -> Iterator[subprocess.Popen[bytes]]:
-        """A node as an OS process, which ends with the context."""
+    def running(
+        self, name: str, parameters: Parameters, command: Sequence[str] = ()
+    ) -> Iterator[subprocess.Popen[bytes]]:
+        """A node as an OS process, which ends with the context.
+
+        :param command: arguments of the Python interpreter; by default those that run the node.
+        """
         words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
         process = subprocess.Popen(
-            [sys.executable, *node_command(name), "--ros-args", *words],
+            [sys.executable, *(command or node_command(name)), "--ros-args", *words],
             cwd=ROOT,
             env=os.environ | {"ROS_DOMAIN_ID": str(self._domain)},
             stdin=subprocess.DEVNULL,
