@@ -20,6 +20,7 @@ hypothesis.settings.load_profile("repeatable")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 WAIT = 120.0  # s, for what normally takes less than one; a machine may be busy
+POLL = 0.05  # s, between two looks at what no message tells
 # Files in which nodes run.
 NODES = ("test_ros_", "test_view_page", "test_package_compilation", "test_process_table", "test_benchmark_live")
 # Files that take longest begin first, so that no worker is left alone with one.
@@ -126,13 +127,13 @@ class Listener:
             assert time.monotonic() < deadline, "waited in vain"
             for process in alive:
                 assert process.poll() is None, process.communicate()[1]
-            self.executor.spin_once(timeout_sec=0.02)
+            self.executor.spin_once(timeout_sec=POLL)
 
     def spin(self, seconds):
         """Listen for a while in which nothing in particular is awaited."""
         deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline:
-            self.executor.spin_once(timeout_sec=0.02)
+        while (left := deadline - time.monotonic()) > 0.0:
+            self.executor.spin_once(timeout_sec=left)
 
     def call(self, kind, name, request):
         """The answer of a service."""

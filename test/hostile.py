@@ -298,8 +298,8 @@ class Stranger:
 
     def spin(self, seconds):
         deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline:
-            self.executor.spin_once(timeout_sec=0.002)
+        while (left := deadline - time.monotonic()) > 0.0:
+            self.executor.spin_once(timeout_sec=left)
 
     def topics(self):
         """{topic: type} of what the nodes listen to."""
@@ -382,7 +382,7 @@ class Stranger:
         begin = time.monotonic()
         future = client.call_async(request)
         while not future.done() and time.monotonic() < begin + ANSWER_TIMEOUT:
-            self.executor.spin_once(timeout_sec=0.002)
+            self.executor.spin_once(timeout_sec=0.1)
         self.slowest = max(self.slowest, time.monotonic() - begin)
         self.called[name] += 1
         if not future.done():
