@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 import sys
 from collections.abc import Callable
@@ -14,6 +15,9 @@ from sphinx.application import Sphinx
 from sphinx.config import Config
 from sphinx.domains.python import ObjectEntry, PythonDomain
 from sphinx.environment import BuildEnvironment
+
+# A build makes millions of objects and keeps most of them: the garbage collector need not look so often.
+gc.set_threshold(200_000, 20, 100)
 
 FindObject = Callable[..., list[tuple[str, ObjectEntry]]]
 
