@@ -12,7 +12,7 @@ from setuptools import find_packages, setup
 
 NAME = "hmt_slam_ros"
 TABLE = run_path(f"{NAME}/process_table.py")
-NODES = TABLE["node_names"]()
+NODES = TABLE["program_names"]()
 DOCS = ("myst-parser>=4.0", "sphinx>=8.1", "sphinx-autoapi>=3.4")
 SHARED = ("launch", "config", "data/malaga_one_loop")
 

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
@@ -27,7 +28,8 @@ from hmt_slam_ros.messages.documents import RobotStatus, decode
 from hmt_slam_ros.messages.messages import EarlyEstimate, LocalEstimate
 from hmt_slam_ros.metric_slam.look_ahead import EarlyEstimateRecord
 from hmt_slam_ros.open_log import open_log
-from hmt_slam_ros.process_table import process_names
+from hmt_slam_ros.process_memory import proportional_set_size
+from hmt_slam_ros.process_table import ALL, process_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import stamp_from_time
 from hmt_slam_ros.ros.topics import DOCUMENTS, ODOM, POSE, ROBOT_STATUS, SCAN
@@ -59,6 +61,9 @@ RATE = 10.0
 
 LATER = 1.1
 """Largest ratio of the time of a replay to that of its log at that rate."""
+
+MEMORY = 500.0
+"""Largest memory of all nodes on Intel, forked from one program, MB."""
 
 _TIMEOUT = 3600.0
 
@@ -135,6 +140,11 @@ def measure_live(settings: Settings) -> Report:
     report.body.append(table(["", "messages", "median [ms]", "p99 [ms]", "largest [ms]"], rows))
     with open_logs(settings.logs_or(WITH_RELATIONS)) as logs:
         replays = {log.name: replay_log(str(log.path)) for log in logs}
+        if "intel" in replays:
+            path = next(str(log.path) for log in logs if log.name == "intel")
+            together = replay_log(path, [ALL])
+            replays["intel, one program"] = together
+            report.requirements.append(Requirement("intel, one program: memory", together.memory / 1e6, MEMORY, "MB"))
     for name, replay in replays.items():
         report.requirements += [
             Requirement(f"{name}: scans lost", replay.scans - replay.answered_scans, 0),
@@ -203,23 +213,35 @@ class ReplayScores(NamedTuple):
     :ivar scans: of the log.
     :ivar answered_scans: number of scans with a pose.
     :ivar time_ratio: ratio of its time to that of the log at this rate.
+    :ivar memory: proportional set size of all OS processes at the end, bytes.
     """
 
     scans: int
     answered_scans: int
     time_ratio: float
+    memory: int
 
 
-def replay_log(log: str) -> ReplayScores:
-    """Replay a log at ten times real time."""
+def replay_log(log: str, programs: Sequence[str] = PROCESSES) -> ReplayScores:
+    """Replay a log at ten times real time.
+
+    :param programs: those that run the processes.
+    """
     duration = open_log(log).duration / RATE
-    with _run_nodes() as listener:
+    with Listener() as listener, ExitStack() as stack:
+        started = [stack.enter_context(listener.running(name, {})).pid for name in programs]
         answered_scans = _count_documents(listener, DOCUMENTS[LocalEstimate])
         begin = time.monotonic()
         status = _play_log(listener, log, 0.0, rate=RATE, flow_control=True)
         seconds = time.monotonic() - begin
         listener.wait_until(lambda: answered_scans() >= status.scans)
-        return ReplayScores(status.scans, answered_scans(), seconds / duration)
+        memory = sum(proportional_set_size(process) for pid in started for process in (pid, *_children(pid)))
+        return ReplayScores(status.scans, answered_scans(), seconds / duration, memory)
+
+
+def _children(pid: int) -> list[int]:
+    """Pids of the children of an OS process."""
+    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()]
 
 
 def count_unanswered(passed: MessageTimes) -> int:
@@ -236,11 +258,12 @@ def _count_documents(listener: Listener, topic: str) -> Callable[[], int]:
 
 
 def _replay_table(replays: dict[str, ReplayScores]) -> str:
-    head = ["log", "scans", "with a pose", f"time / that of the log at {RATE:g} times"]
-    return table(
-        head,
-        [[name, str(own.scans), str(own.answered_scans), f"{own.time_ratio:.2f}"] for name, own in replays.items()],
-    )
+    head = ["log", "scans", "with a pose", f"time / that of the log at {RATE:g} times", "memory [MB]"]
+    rows = []
+    for name, own in replays.items():
+        memory = f"{own.memory / 1e6:.0f}"
+        rows.append([name, str(own.scans), str(own.answered_scans), f"{own.time_ratio:.2f}", memory])
+    return table(head, rows)
 
 
 @contextmanager

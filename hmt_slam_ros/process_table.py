@@ -18,6 +18,9 @@ _ROS = "hmt_slam_ros.ros"
 RUN_NODE = f"{_ROS}.run_node"
 """Module that runs any node by its name."""
 
+ALL = "all"
+"""Program that runs all processes, each forked from it."""
+
 COORDINATOR = "slam"
 """The process that starts coordinated requests; all others take part."""
 
@@ -210,6 +213,11 @@ def participant_names() -> tuple[str, ...]:
 def node_names() -> tuple[str, ...]:
     """Names of all nodes that have an executable."""
     return tuple(row.name for row in (*PROCESSES, *COMPANIONS))
+
+
+def program_names() -> tuple[str, ...]:
+    """Names of all executables of nodes: one for each node, and one for all processes."""
+    return (*node_names(), ALL)
 
 
 def process_row(name: str) -> ProcessRow:

@@ -6,7 +6,7 @@ from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, LaunchLogDir, PathJoinSubstitution
 from launch_ros.actions import Node
 
-from hmt_slam_ros.process_table import process_names
+from hmt_slam_ros.process_table import ALL, process_names
 from hmt_slam_ros.ros.launch_actions import PACKAGE, RESPAWN, common_arguments, node, switch, value
 
 PARAMETERS = {
@@ -49,6 +49,7 @@ def _arguments() -> list[DeclareLaunchArgument]:
         switch("use_sim_time", "false", "Take the time from /clock, for a replay or a simulator."),
         switch("start_lost", "true", "Whether the robot may be anywhere in that map; else it is where it was."),
         switch("save_on_shutdown", "false", "Whether the map is saved there before the nodes end."),
+        switch("one_program", "false", "Whether one program forks all nodes, which takes half of the memory."),
         switch("autostart", "true", "Whether the nodes begin by themselves; else a lifecycle manager leads them."),
     ]
 
@@ -56,10 +57,12 @@ def _arguments() -> list[DeclareLaunchArgument]:
 def _processes(context: LaunchContext) -> list[Node]:
     parameters = {name: value(name, kind) for name, kind in PARAMETERS.items()}
     mode = LaunchConfiguration("mode").perform(context)
+    is_one_program = LaunchConfiguration("one_program").perform(context) == "true"
     if mode:
         parameters["mode"] = mode
     log_level = ["--log-level", LaunchConfiguration("log_level")]
-    return [node(process, parameters, ros_arguments=log_level, **RESPAWN) for process in process_names()]
+    programs = [ALL] if is_one_program else process_names()
+    return [node(program, parameters, ros_arguments=log_level, **RESPAWN) for program in programs]
 
 
 def _view() -> Node:

@@ -16,10 +16,10 @@ import pytest
 import yaml
 
 import hmt_slam_ros
-from hmt_slam_ros.process_table import node_names
+from hmt_slam_ros.process_table import program_names
 
 ROOT = Path(__file__).resolve().parent.parent
-NODES = node_names()
+NODES = program_names()
 LAUNCH_FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 
 

@@ -148,6 +148,7 @@ FIGURES = RunMetrics(
     "lock-step",
     {"slam": np.arange(SCANS) * 1e-3, "aam": np.zeros(SCANS)},
     {"hmt_slam": 10**8},
+    {"hmt_slam": 9 * 10**7},
     wall_seconds=2.0,
     cpu_seconds=1.5,
     refinement_seconds=0.1,
@@ -288,6 +289,7 @@ def test_the_report_counts_what_happened(folder: Path) -> None:
     assert report["particles"] == particles
     assert report["configuration"]["local_map"]["cell"] == 0.1
     assert (report["seed"], report["peak_rss_bytes"]) == (7, {"hmt_slam": 10**8})
+    assert report["pss_bytes"] == {"hmt_slam": 9 * 10**7}
     assert report["notices"] == [{"process": "slam", "text": "two scans had no beam: clean the laser"}]
     assert {"numpy", "numba", "hmt_slam_ros"} <= set(report["versions"])
 

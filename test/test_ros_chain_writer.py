@@ -19,10 +19,11 @@ from worlds import box, scan_in
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.messages import HypothesisEstimate, Keyframe, LocalEstimate, ScanPoses
 from hmt_slam_ros.messages.system_name import SystemName
+from hmt_slam_ros.process_memory import current_rss
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.chain_writer import ChainWriter
-from hmt_slam_ros.ros.diagnostics import NodeDiagnostics, current_rss
+from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
 from hmt_slam_ros.ros.guarded_node import GuardedNode
 from hmt_slam_ros.ros.message_io import Outbox
 

@@ -21,8 +21,8 @@ from test_ros_two_systems import free_port
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
 from hmt_slam_ros.configuration import load_configuration
+from hmt_slam_ros.process_memory import current_rss
 from hmt_slam_ros.process_table import DOCUMENTS, PROCESSES, node_command, process_names
-from hmt_slam_ros.ros.diagnostics import current_rss
 from hmt_slam_ros.ros.replay import replay
 
 ROOT = Path(__file__).resolve().parent.parent

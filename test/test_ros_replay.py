@@ -152,6 +152,7 @@ def test_the_report_accounts_for_every_scan_and_every_process(folders):
     assert set(report["processes"]) == NODES - {"robot"}
     assert set(report["peak_rss_bytes"]) == NODES
     assert all(20e6 < rss < 4e9 for rss in report["peak_rss_bytes"].values())
+    assert all(0 < pss < report["peak_rss_bytes"][name] for name, pss in report["pss_bytes"].items())
     slam = report["processes"]["slam"]
     assert 0.0 < slam["mean_ms_per_scan"] < slam["max_ms_per_scan"]
     assert report["cpu_s"] > slam["total_s"]

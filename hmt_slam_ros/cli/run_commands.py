@@ -23,6 +23,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.offline.runtime import run_log
 from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.process_memory import proportional_set_size
 from hmt_slam_ros.results.final_map import FinalMap, deskewed_scans, final_map
 from hmt_slam_ros.results.hmt_map import RunState, read_run_state, read_saved_map
 from hmt_slam_ros.results.log_reading import describe_log, describe_parameter_changes, is_newest_log, map_folder
@@ -112,6 +113,7 @@ def run_measured(
         seconds_per_scan=result.seconds_per_scan,
         # ru_maxrss counts in units of 1024 bytes on Linux.
         peak_rss={"hmt_slam": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss},
+        pss={"hmt_slam": proportional_set_size()},
         wall_seconds=time.monotonic() - wall,
         cpu_seconds=time.process_time() - cpu,
         refinement_seconds=time.process_time() - begin,

@@ -74,6 +74,7 @@ class RunMetrics:
     :ivar runtime: "lock-step" or "nodes".
     :ivar seconds_per_scan: {process: shape (n,), computing time for each scan, s}.
     :ivar peak_rss: {OS process: largest resident memory, bytes}.
+    :ivar pss: {OS process: proportional set size at the end, bytes}: memory that n processes share counts 1/n in each.
     :ivar wall_seconds: time from the first record to the last answer, s.
     :ivar cpu_seconds: CPU time of all OS processes together, s.
     :ivar refinement_seconds: CPU time of the final refinement, s.
@@ -84,6 +85,7 @@ class RunMetrics:
     runtime: str
     seconds_per_scan: Mapping[str, NDArray[np.float64]]
     peak_rss: Mapping[str, int]
+    pss: Mapping[str, int]
     wall_seconds: float
     cpu_seconds: float
     refinement_seconds: float
@@ -263,6 +265,7 @@ def build_report(recording: Recording, configuration: Configuration, figures: Ru
         "notices": [{"process": notice.process, "text": notice.text} for notice in recording.notices],
         "processes": {name: _cost_summary(seconds) for name, seconds in figures.seconds_per_scan.items()},
         "peak_rss_bytes": dict(figures.peak_rss),
+        "pss_bytes": dict(figures.pss),
         "memory_bytes": dict(figures.memory) | {"keyframe_scans": scan_bytes(replica.scans.values())},
         "wall_s": figures.wall_seconds,
         "cpu_s": figures.cpu_seconds,

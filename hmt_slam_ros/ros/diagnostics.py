@@ -7,7 +7,6 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
@@ -17,6 +16,7 @@ from std_msgs.msg import Float64MultiArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import Keyframe, LocalEstimate, Message
 from hmt_slam_ros.messages.system_name import SystemName
+from hmt_slam_ros.process_memory import current_rss, peak_rss
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import cost_message
 from hmt_slam_ros.ros.topics import COST, DIAGNOSTICS
@@ -194,21 +194,3 @@ def _message_stamp(message: Message, default: int) -> int:
     if isinstance(message, Keyframe):
         return message.scan.stamp
     return int(getattr(message, "stamp", default))
-
-
-def peak_rss(process: int | str = "self") -> int:
-    """Largest resident memory of an OS process, bytes; 0 where it is unknown."""
-    return _memory(process, "VmHWM")
-
-
-def current_rss(process: int | str = "self") -> int:
-    """Current resident memory of an OS process, bytes; 0 where it is unknown."""
-    return _memory(process, "VmRSS")
-
-
-def _memory(process: int | str, key: str) -> int:
-    try:
-        lines = Path(f"/proc/{process}/status").read_text(encoding="ascii", errors="replace").splitlines()
-    except OSError:
-        return 0
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(key)), 0)

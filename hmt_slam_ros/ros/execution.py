@@ -24,14 +24,11 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.ros.child_processes import FAULT, PARENT_VARIABLE
 
 _SIGEV_THREAD = 2  # <signal.h>
 _CLOCK_MONOTONIC = 1  # <time.h>
 _PR_SET_PDEATHSIG = 1  # <sys/prctl.h>
-PARENT_VARIABLE = "HMT_SLAM_PARENT"
-"""Environment variable with the pid of the process that started this one, and with which it ends."""
-FAULT = 2
-"""Exit status for a fault."""
 _REALTIME_PRIORITY = 1
 """The lowest real-time priority, so that any other real-time program comes first."""
 _GRACE_PERIOD = 8.0

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,9 +18,9 @@ from types import TracebackType
 from typing import IO
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.process_memory import peak_rss, proportional_set_size
 from hmt_slam_ros.process_table import node_command
-from hmt_slam_ros.ros.diagnostics import peak_rss
-from hmt_slam_ros.ros.execution import PARENT_VARIABLE
+from hmt_slam_ros.ros.child_processes import MAX_RESTARTS, PARENT_VARIABLE, RestartLimit
 
 _DOMAINS = range(1, 102)
 """Ids of domains that may be used: 0 is the default, and ports above 101 overlap Linux's outgoing connections."""
@@ -31,8 +30,6 @@ _PARTICIPANTS = 4
 """Participants of a domain whose ports are checked."""
 _STOP_TIMEOUT = 5.0
 """Time from SIGINT to SIGKILL, s."""
-_MAX_RESTARTS, _RESTART_WINDOW = 3, 60.0
-"""Restarts of a node within this many seconds after which it is given up."""
 _TAIL = 3
 """Lines of a node's output in a message."""
 
@@ -89,10 +86,12 @@ class ResourceUsage:
     """Resources of an OS process so far.
 
     :ivar peak_rss: largest resident memory, bytes.
+    :ivar pss: proportional set size, bytes.
     :ivar cpu_seconds: user and system time.
     """
 
     peak_rss: int
+    pss: int
     cpu_seconds: float
 
 
@@ -112,7 +111,7 @@ class NodeProcesses:
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self._folder, self._restartable, self._notify = folder, restartable, notify
         self._start_arguments: dict[str, tuple[Sequence[str], Mapping[str, str]]] = {}
-        self._restart_times: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_MAX_RESTARTS))
+        self._limit = RestartLimit()
 
     def start(self, name: str, arguments: Sequence[str], environment: Mapping[str, str]) -> None:
         """Start the node ``name`` with arguments for ROS."""
@@ -145,13 +144,11 @@ class NodeProcesses:
             self._restart(name, -status)
 
     def _restart(self, name: str, number: int) -> None:
-        now, restart_times = time.monotonic(), self._restart_times[name]
-        if len(restart_times) == _MAX_RESTARTS and now - restart_times[0] < _RESTART_WINDOW:
+        if not self._limit.admits_restart(name):
             raise HmtSlamError(
-                f"the node {name} was killed by signal {number} for the {_MAX_RESTARTS + 1}th time within a minute and "
+                f"the node {name} was killed by signal {number} for the {MAX_RESTARTS + 1}th time within a minute and "
                 f"is not started again, it said: {self.log_tail(name)}"
             )
-        restart_times.append(now)
         self._notify(f"the node {name} was killed by signal {number}: it is started again and goes on where it was")
         self.start(name, *self._start_arguments[name])
 
@@ -164,7 +161,7 @@ class NodeProcesses:
     def usage(self) -> dict[str, ResourceUsage]:
         """{node: resources so far}."""
         return {
-            name: ResourceUsage(peak_rss(process.pid), _cpu_seconds(process.pid))
+            name: ResourceUsage(peak_rss(process.pid), proportional_set_size(process.pid), _cpu_seconds(process.pid))
             for name, process in self.processes.items()
         }
 

@@ -199,6 +199,7 @@ def replay(
             runtime="nodes",
             seconds_per_scan=run.recorder_node.seconds_per_scan(contents.stamps),
             peak_rss={name: usage.peak_rss for name, usage in run.usage.items()},
+            pss={name: usage.pss for name, usage in run.usage.items()},
             wall_seconds=run.wall_seconds,
             cpu_seconds=sum(usage.cpu_seconds for usage in run.usage.values()) + refinement,
             refinement_seconds=refinement,
