@@ -49,7 +49,7 @@ def _arguments() -> list[DeclareLaunchArgument]:
         switch("use_sim_time", "false", "Take the time from /clock, for a replay or a simulator."),
         switch("start_lost", "true", "Whether the robot may be anywhere in that map; else it is where it was."),
         switch("save_on_shutdown", "false", "Whether the map is saved there before the nodes end."),
-        switch("one_program", "false", "Whether one program forks all nodes, which takes half of the memory."),
+        switch("one_program", "false", "Whether one program forks all nodes, which takes two thirds of the memory."),
         switch("autostart", "true", "Whether the nodes begin by themselves; else a lifecycle manager leads them."),
     ]
 
