@@ -179,7 +179,7 @@ class DelayedRun:
                 self.pending.extend(process.handle(message))
 
     def _disturb(self):
-        if self.random.random() < 0.2:
+        if self.random.random() < 0.08:
             self.early += len(self.processes["slam"].look_ahead())
         if self.random.random() < 0.01:
             # The others have a state between two events only.
