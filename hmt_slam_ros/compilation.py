@@ -11,7 +11,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from numba.core.caching import Cache
 
 _reporters: list[Callable[[str], None]] = []
+_declared: list[Any] = []
 
 _KEPT = 8
 """Digests that are kept for each module, those of the last use: of several installations, and of versions before."""
@@ -46,11 +47,17 @@ def njit(**options: object) -> Callable[[Callable[..., Any]], Any]:
         chosen = options if folder is not None else {**options, "cache": False}
         before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder or "")
         try:
-            return numba.njit(**chosen)(function)
+            _declared.append(numba.njit(**chosen)(function))
         finally:
             numba.config.CACHE_DIR = before
+        return _declared[-1]
 
     return compile_lazily
+
+
+def declared_kernels() -> Sequence[Any]:
+    """The kernels of all modules in memory, as numba's dispatchers."""
+    return tuple(_declared)
 
 
 @cache

@@ -40,6 +40,7 @@ def build_parser() -> argparse.ArgumentParser:
         (_add_export_arguments, "result_commands", "export", "write a map's topology as GraphML, or its grid for nav2"),
         (_add_doctor_arguments, "log_commands", "doctor", "say what is wrong with a log or with the running system"),
         (_add_configuration, "arguments", "parameters", "print every parameter as a YAML file"),
+        (_add_nothing, "kernel_commands", "compile", "compile all kernels for this machine, once"),
     ):
         command = commands.add_parser(name, help=description)
         command.set_defaults(function=f"hmt_slam_ros.cli.{module}:run_{name}")
@@ -66,6 +67,10 @@ def run_parameters(options: argparse.Namespace) -> None:
     from hmt_slam_ros.configuration.documents import ros_yaml  # noqa: PLC0415  no other command needs it
 
     print(ros_yaml(chosen_configuration(options)), end="")
+
+
+def _add_nothing(_command: argparse.ArgumentParser) -> None:
+    """A command without arguments."""
 
 
 def _add_map_arguments(command: argparse.ArgumentParser) -> None:

@@ -34,6 +34,43 @@ def report_left_out(log: Log, command: str) -> None:
         print(f"hmt_slam {command}: {sentence}", file=sys.stderr)
 
 
+class MovingLine:
+    """A line that is written over on a terminal; a file has one every ten seconds. As a context it ends the line."""
+
+    def __init__(self, stream: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
+        """:param stream: stream to write to.
+
+        :param clock: returns seconds since any start.
+        """
+        self._stream, self._clock = stream, clock
+        self.is_terminal = stream.isatty()
+        self._last, self._was_shown = clock(), False
+
+    def show(self, text: str, *, is_last: bool = False) -> None:
+        """Write the line where the period since the last one is over.
+
+        :param is_last: whether a terminal shows it in any case.
+        """
+        now = self._clock()
+        due = now - self._last >= (_TTY_PERIOD if self.is_terminal else _FILE_PERIOD)
+        if not due and not (self.is_terminal and is_last):
+            return
+        self._last, self._was_shown = now, True
+        self._stream.write(f"\r{text}\x1b[K" if self.is_terminal else f"{text}\n")
+        self._stream.flush()
+
+    def __enter__(self) -> MovingLine:
+        """Nothing is prepared."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the line."""
+        if self.is_terminal and self._was_shown:
+            self._stream.write("\n")
+
+
 class Progress:
     """Shows the progress of a run. Call it with the number of scans done; as a context it ends the moving line."""
 
@@ -52,22 +89,12 @@ class Progress:
         :param clock: returns seconds since any start.
         """
         self._scans, self._log_seconds = max(scans, 1), log_seconds
-        self._stream = stream or sys.stderr
-        self._clock = clock
-        self._is_terminal = self._stream.isatty()
-        self._begin = self._last = clock()
-        self._was_shown = False
+        self._line, self._clock = MovingLine(stream or sys.stderr, clock), clock
+        self._begin = clock()
 
     def __call__(self, done: int) -> None:
         """Write a line where the period since the last one is over, and at the end."""
-        now = self._clock()
-        due = now - self._last >= (_TTY_PERIOD if self._is_terminal else _FILE_PERIOD)
-        if not due and not (self._is_terminal and done >= self._scans):
-            return
-        self._last, self._was_shown = now, True
-        line = self.line(done, now - self._begin)
-        self._stream.write(f"\r{line}\x1b[K" if self._is_terminal else f"{line}\n")
-        self._stream.flush()
+        self._line.show(self.line(done, self._clock() - self._begin), is_last=done >= self._scans)
 
     def line(self, done: int, elapsed: float) -> str:
         """Bar, count, speed and remaining time.
@@ -76,7 +103,7 @@ class Progress:
         """
         share = min(done / self._scans, 1.0)
         filled = int(_BAR * share)
-        bar = f"[{'#' * filled}{'.' * (_BAR - filled)}] " if self._is_terminal else ""
+        bar = f"[{'#' * filled}{'.' * (_BAR - filled)}] " if self._line.is_terminal else ""
         speed = share * self._log_seconds / max(elapsed, 1e-9)
         left = elapsed * (1.0 - share) / share if share > 0.0 else 0.0
         rest = f"{_duration(left)} left" if share < 1.0 else "the final map is being made"
@@ -90,8 +117,7 @@ class Progress:
         self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
     ) -> None:
         """End the moving line."""
-        if self._is_terminal and self._was_shown:
-            self._stream.write("\n")
+        self._line.__exit__(kind, fault, trace)
 
 
 def _duration(seconds: float) -> str:

@@ -15,6 +15,7 @@ import traceback
 from contextlib import suppress
 from pathlib import Path
 
+from hmt_slam_ros.kernel_loading import KernelLoading
 from hmt_slam_ros.process_table import process_names, process_row, resolve, resolve_class
 from hmt_slam_ros.ros.child_processes import FAULT, PARENT_VARIABLE, RestartLimit
 
@@ -35,11 +36,12 @@ def run_all() -> int:
 
 
 def _load_libraries() -> None:
-    """Load what the nodes need, and keep the garbage collector from touching it in each of them."""
+    """Load what the nodes need and the kernels that are cached; the garbage collector of each node leaves it alone."""
     for name in process_names():
         row = process_row(name)
         resolve(row.factory)
         resolve_class(row.state)
+        KernelLoading(name).load_cached()
     assert len(list(Path("/proc/self/task").iterdir())) == 1, "threads do not survive a fork"
     gc.collect()
     gc.freeze()

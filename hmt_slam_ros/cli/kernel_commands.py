@@ -1,0 +1,19 @@
+"""The command ``compile``, which compiles the kernels of all nodes and commands at the installation."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+from hmt_slam_ros.cli.terminal import MovingLine
+from hmt_slam_ros.kernel_loading import KernelLoading
+from hmt_slam_ros.kernel_table import known_calls
+
+
+def run_compile(_options: argparse.Namespace) -> None:
+    """Compile what is not cached, with the time left, and say so."""
+    begin, loading = time.monotonic(), KernelLoading()
+    with MovingLine(sys.stderr) as line:
+        loading.run(lambda: line.show(loading.progress))
+    print(f"{len(known_calls())} kernels are compiled; {time.monotonic() - begin:.1f} s")
