@@ -14,8 +14,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from hmt_slam_ros.errors import HmtSlamError
-
 TABLE = Path(__file__).with_suffix(".txt")
 
 COMMAND = "hmt_slam"
@@ -74,7 +72,7 @@ def describe_types(types: tuple[Any, ...]) -> str:
 
     An array has the number of its axes and its layout: C, F (Fortran) or A (any), and r where it is read-only.
 
-    :raises HmtSlamError: for a type that has no notation here.
+    :raises TypeError: for a type that has no notation here.
     """
     return f"({', '.join(_describe(one) for one in types)})"
 
@@ -90,7 +88,7 @@ def _describe(one: Any) -> str:  # noqa: ANN401  numba has no types
         return inner if made_of is None else f"{made_of.__module__}:{made_of.__qualname__}{inner}"
     if one == types.none or isinstance(one, types.Number | types.Boolean):
         return str(one.name)
-    raise HmtSlamError(f"the table of kernels has no notation for {one}: pass the kernel another type")
+    raise TypeError(f"there is no notation for {one}")
 
 
 def parse_types(text: str) -> tuple[Any, ...]:

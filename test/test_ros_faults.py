@@ -326,6 +326,9 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
     maps = {nodes: nodes.subscribe(OccupancyGrid, MAP, topics.LATCHED) for nodes in (one, two)}
     tf = {topic: listener.subscribe(TFMessage, topic, topics.TF_STATIC) for topic in ("/one/tf_static", "/tf_static")}
     tf |= {topic: listener.subscribe(TFMessage, topic, topics.STREAM) for topic in ("/one/tf", "/tf")}
+    # Of estimates that come when all odometry has come, rtl says no pose.
+    for nodes in (one, two):
+        nodes.until(lambda nodes=nodes: all(map(nodes.diagnosis, NODES)))
     drives = {one: 40, two: 60}
     for nodes, scans in drives.items():
         folder = tmp_path / f"log_{scans}"

@@ -4,6 +4,8 @@ import ctypes
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import time
 from functools import partial
 
@@ -99,3 +101,14 @@ def cling(sentence):
             raise HmtSlamError(sentence)
 
     raise SystemExit(run(partial(Clinging, "clinging"), spin))
+
+
+def test_a_signal_while_an_executor_is_made_leaves_no_traceback():
+    program = (
+        "import sys, rclpy\n"
+        "from rclpy.executors import SingleThreadedExecutor\n"
+        "from hmt_slam_ros.ros.execution import run\n"
+        "sys.exit(run(lambda: (rclpy.shutdown(), SingleThreadedExecutor())[1], lambda node: None))\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")

@@ -129,6 +129,7 @@ def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None]) -> int:
     :returns: exit status.
     """
     stop = _SignalListener()
+    sys.unraisablehook = _report_unraisable
     nodes: list[NodeType] = []
     try:
         status = _run_node(make, spin, stop, nodes)
@@ -183,6 +184,12 @@ def _run_node(
         print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr, flush=True)
         return FAULT
     return 0
+
+
+def _report_unraisable(unraisable: sys.UnraisableHookArgs) -> None:
+    """Report an exception of an object that is deleted, but not those of rclpy's after a signal."""
+    if rclpy.ok() or not isinstance(unraisable.exc_value, _CONTEXT_LOST):
+        sys.__unraisablehook__(unraisable)
 
 
 class _SignalListener:
