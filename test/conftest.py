@@ -16,6 +16,9 @@ from hmt_slam_ros.process_table import RUN_NODE, node_command
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("repeatable")
 
+# Messages check the names and types of their fields, which they do not by default.
+os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
+
 # A shell that runs the tests in the background has SIGINT ignored, and all programs that they start would inherit it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -1,16 +1,14 @@
 """Programs of the package as OS processes that do not load numpy, numba and the kernels at each start.
 
 A server loads them once and forks a process for every program, which then runs as by ``python -m``: with arguments,
-environment, working directory, output and exit status of its own. A command starts in a quarter of the time, and a node
-in less: rclpy and the classes of nodes are also loaded where ROS is installed. Nothing is initialized: a program makes
-its own participant of DDS, in its own domain.
+environment, working directory, output and exit status of its own. A node starts in half of the time, a command in a
+quarter. rclpy is loaded by each program itself: its threads would not survive a fork.
 """
 
 import atexit
 import contextlib
 import ctypes
 import gc
-import importlib.util
 import io
 import json
 import os
@@ -21,7 +19,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import warnings
 from functools import cache
 from pathlib import Path
 
@@ -31,17 +28,10 @@ COMMAND = "hmt_slam_ros.cli.main"
 """Module of the command ``hmt_slam``."""
 
 _SET_CHILD_SUBREAPER = 36  # <sys/prctl.h>
-# Messages check the names and types of their fields, which they do not by default.
-os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
-
-_READ_AT_START = ("PYTHON", "NUMBA_", "ROS_PYTHON_CHECK_FIELDS", "RMW_IMPLEMENTATION")
-"""Beginnings of names of environment variables that count when Python, numba, messages or rclpy are loaded."""
+_READ_AT_START = ("PYTHON", "NUMBA_")
+"""Beginnings of names of environment variables that count when Python or numba is loaded."""
 _ENVIRONMENT = dict(os.environ)
 """The environment of the tests, before one of them changes it."""
-_TRACING_PREFIXES = ("ust_", "lttng_ust_")
-"""Beginnings of names of the functions of LTTng, before 2.13 and since."""
-_TRACING_THREADS = 2
-_SIGNAL_SET = 128  # bytes of a sigset_t
 _POLL = 0.001  # s
 _LONGEST = 1 << 20
 """Most bytes of a request."""
@@ -143,83 +133,13 @@ def _server():
 
 
 def load():
-    """Load what commands and nodes need, but the modules that they run: by mapping a log.
-
-    :returns: tracing that goes on in each program.
-    """
+    """Load what commands and nodes need, but the modules that they run and rclpy: by mapping a log."""
     from hmt_slam_ros.cli.arguments import build_parser  # noqa: PLC0415  it sets the number of threads before numpy
     from hmt_slam_ros.cli.run_commands import run_map  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
         run_map(build_parser().parse_args(["map", str(LOG), "--out", f"{folder}/out"]))
-    assert _thread_count() == 1, "threads do not survive a fork"
-    if not importlib.util.find_spec("rclpy"):
-        return _Tracing([])
-    tracing = _load_nodes()
-    assert _thread_count() == 1, "threads do not survive a fork"
-    return tracing
-
-
-def _load_nodes():
-    """Load rclpy, the classes of all nodes, and what converts their messages.
-
-    :returns: the tracing of rclpy, in a process without its threads.
-    """
-    from rclpy.type_support import check_for_type_support  # noqa: PLC0415  only where there is ROS
-
-    libraries = {line.split()[-1] for line in Path("/proc/self/maps").read_text().splitlines() if "/liblttng" in line}
-    tracing = _Tracing(map(ctypes.CDLL, sorted(libraries)))
-    tracing.leave_threads()
-    from hmt_slam_ros.process_table import node_names, node_row, resolve_class  # noqa: PLC0415  they load rclpy
-
-    for name in node_names():
-        resolve_class(node_row(name).node_class)
-    modules = [module for name, module in sys.modules.items() if name.endswith((".msg", ".srv"))]
-    for kind in [kind for module in modules for kind in vars(module).values()]:
-        if hasattr(type(kind), "_TYPE_SUPPORT"):
-            check_for_type_support(kind)
-    return tracing
-
-
-class _Tracing:
-    """The tracing of rclpy (LTTng), which starts two threads when it is loaded.
-
-    It has functions for a program that forks: they stop it, and start other threads in the new process.
-    """
-
-    def __init__(self, libraries):
-        """Find its functions.
-
-        :param libraries: that are loaded; without tracing none has them.
-        """
-        names = [(library, prefix) for library in libraries for prefix in _TRACING_PREFIXES]
-        found = [(library, prefix) for library, prefix in names if hasattr(library, f"{prefix}before_fork")]
-        self._functions = [
-            (getattr(library, f"{prefix}before_fork"), getattr(library, f"{prefix}after_fork_child"))
-            for library, prefix in found[:1]
-        ]
-        self._signals = ctypes.create_string_buffer(_SIGNAL_SET)
-
-    def leave_threads(self):
-        """Go on in a process without its threads, while this one waits for its end."""
-        if not self._functions:
-            return
-        assert _thread_count() <= 1 + _TRACING_THREADS, "threads do not survive a fork"
-        for before_fork, _ in self._functions:
-            before_fork(self._signals)
-        with warnings.catch_warnings(action="ignore"):  # of threads
-            without_threads = os.fork()
-        if without_threads:
-            os._exit(os.waitstatus_to_exitcode(os.waitpid(without_threads, 0)[1]))
-
-    def go_on(self):
-        """Start its threads in a process that was forked without them."""
-        for _, after_fork in self._functions:
-            after_fork(self._signals)
-
-
-def _thread_count():
-    return len(list(Path("/proc/self/task").iterdir()))
+    assert len(list(Path("/proc/self/task").iterdir())) == 1, "threads do not survive a fork"
 
 
 def serve(requests):
@@ -269,9 +189,8 @@ def become(request, streams):
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.path[0] = str(ROOT)
-    tracing = load()
+    load()
     gc.freeze()
     module, *arguments = serve(socket.socket(fileno=int(sys.argv[1])))
-    tracing.go_on()
     sys.argv = ["-m", *arguments]
     runpy.run_module(module, run_name="__main__", alter_sys=True)

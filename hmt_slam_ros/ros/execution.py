@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -130,6 +131,8 @@ def run(make: Callable[[], NodeType], spin: Callable[[NodeType], None]) -> int:
     """
     stop = _SignalListener()
     sys.unraisablehook = _report_unraisable
+    # Of a node that a signal interrupts while it is made.
+    warnings.filterwarnings("ignore", "Failed to fini", RuntimeWarning)
     nodes: list[NodeType] = []
     try:
         status = _run_node(make, spin, stop, nodes)
