@@ -1,14 +1,18 @@
 """rosbag2 recordings as other programs make them: topics, transforms, odd scans, damage."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs import bag_files
 from hmt_slam_ros.logs.ros_types import LASER_SCAN, ODOMETRY, TRANSFORMS, typestore
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Odometry, Scan
 
+BUNDLED = Path(__file__).resolve().parent.parent / "data" / "malaga_one_loop"
 INF, NAN = np.inf, np.nan
 
 
@@ -268,3 +272,13 @@ def test_what_is_no_log_is_one_sentence(tmp_path):
         assert "\n" not in str(caught.value)
     with pytest.raises(HmtSlamError, match=r"without a bag's metadata\.yaml"):
         open_log(tmp_path)
+
+
+def test_a_bag_of_which_nobody_reads_the_rest_is_closed_without_a_fault(monkeypatch):
+    def fail(_reader):
+        raise OSError("the disk is gone")
+
+    messages = bag_files._read_file(BUNDLED, {connection.topic for connection in bag_files._connections(BUNDLED)})
+    next(messages)
+    monkeypatch.setattr(bag_files.Reader, "close", fail)
+    messages.close()

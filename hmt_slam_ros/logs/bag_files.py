@@ -188,5 +188,7 @@ def _damage_as_error(path: Path) -> Iterator[None]:
     except HmtSlamError:
         raise
     except Exception as error:
+        if isinstance(error.__context__, GeneratorExit):  # nobody reads on, as after a signal
+            return
         cause = shorten(str(error).strip().rstrip(".") or type(error).__name__)
         raise HmtSlamError(f"{path} is no complete rosbag2, truncated or damaged ({cause}): {_REMEDY}") from error
