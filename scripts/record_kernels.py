@@ -115,9 +115,10 @@ def run_recorded(kind: str, *words: str) -> None:
 
 def record_calls() -> set[tuple[str, str]]:
     """A set to which each call from Python adds its kernel and types, if it is the first one of these types."""
-    from numba.core.dispatcher import Dispatcher  # noqa: PLC0415
-
     import hmt_slam_ros.cli  # noqa: PLC0415, F401  it sets the number of threads before numpy is loaded
+
+    # isort: split
+    from numba.core.dispatcher import Dispatcher  # noqa: PLC0415
 
     calls: set[tuple[str, str]] = set()
     compile_for_arguments = Dispatcher._compile_for_args  # type: ignore[attr-defined]

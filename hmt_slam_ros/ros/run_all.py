@@ -72,7 +72,7 @@ class _ForkedNodes:
         if self._stopped or status == 0:
             return
         if status < 0 and self._limit.admits_restart(name):
-            _say(f"the node {name} was killed by signal {-status}: it is started again and goes on where it was")
+            _say(f"the node {name} was killed by signal {-status}: it is started again")
             self._fork(name)
         else:
             _say(f"the node {name} ended with status {status}, and all others with it")
