@@ -17,8 +17,8 @@ from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.simulation import open_simulated
 from hmt_slam_ros.submap.local_mapping import LocalMapping
-from hmt_slam_ros.topological_inference.global_localization import UNMAPPED_PRIOR, PoseDistribution
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
+from hmt_slam_ros.topological_inference.pose_distribution import UNMAPPED_PRIOR, PoseDistribution
 
 CONFIGURATION = with_changes(Configuration(), {"places.prior_temper": 0.5})
 

@@ -7,7 +7,7 @@ from test_topological_inference_tsbi import ring_with_two_hypotheses
 
 from hmt_slam_ros.messages.map_changes import PrunedKeyframe, StaleBeams
 from hmt_slam_ros.messages.messages import AreaEvents, Hypothesis
-from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
+from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 

@@ -22,9 +22,7 @@ from hmt_slam_ros.registration.consistency import (
 from hmt_slam_ros.topological_inference import event_work
 from hmt_slam_ros.topological_inference.event_work import EventWork
 from hmt_slam_ros.topological_inference.global_localization import (
-    UNMAPPED_PRIOR,
     GlobalSearch,
-    PoseDistribution,
     PoseHint,
     begin_search,
     check_candidates,
@@ -33,13 +31,17 @@ from hmt_slam_ros.topological_inference.global_localization import (
     localize_globally,
     plausible_areas,
     search_region,
-    summarize_localization,
 )
 from hmt_slam_ros.topological_inference.global_scan_matching import (
     GlobalScanMatcher,
     PoseCandidate,
     Region,
     RegionMatch,
+)
+from hmt_slam_ros.topological_inference.pose_distribution import (
+    UNMAPPED_PRIOR,
+    PoseDistribution,
+    summarize_localization,
 )
 
 shares = st.lists(st.floats(0.001, 1.0), min_size=1, max_size=5)

@@ -28,11 +28,11 @@ from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.topological_inference import kidnapping, relocalization
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
-from hmt_slam_ros.topological_inference.global_localization import UNMAPPED_PRIOR, PoseDistribution
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
 from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, HypothesisState, Lost, PoseInArea, Tracking
 from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
 from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingPriors
+from hmt_slam_ros.topological_inference.pose_distribution import UNMAPPED_PRIOR, PoseDistribution
 from hmt_slam_ros.topological_inference.relocalization import KIDNAPPED_UNMAPPED_PRIOR
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 

@@ -18,7 +18,7 @@ from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.topological_inference import event_work, relocalization
 from hmt_slam_ros.topological_inference.branches import Branches, Parent
 from hmt_slam_ros.topological_inference.event_work import EventWork
-from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseDistribution, PoseHint
+from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseHint
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     FalseAlarm,
@@ -28,6 +28,7 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import (
     Tracking,
 )
 from hmt_slam_ros.topological_inference.kidnapping_prior import EventCounts
+from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
 OPTIONS = replace(Configuration().tsbi, relocalization_probability=0.8, relocalization_share=0.6, hint_probability=0.7)
 ARC = np.array([3.0, 1.0, 0.7])

@@ -19,9 +19,9 @@ from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 from hmt_slam_ros.topological_inference import global_scan_matching as module
 from hmt_slam_ros.topological_inference.branches import Parent
 from hmt_slam_ros.topological_inference.branching import Branching
-from hmt_slam_ros.topological_inference.global_localization import UNMAPPED_PRIOR
 from hmt_slam_ros.topological_inference.global_scan_matching import FreeSpaceCheck, GlobalScanMatcher, query_bounds
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState, Lost
+from hmt_slam_ros.topological_inference.pose_distribution import UNMAPPED_PRIOR
 
 
 def test_walls_are_tested_between_keyframes_within_twelve_meters_of_each_other(monkeypatch):

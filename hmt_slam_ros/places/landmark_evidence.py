@@ -20,7 +20,7 @@ from hmt_slam_ros.places.loop_detector import (
 from hmt_slam_ros.places.relocalization_prior import RelocalizationPrior
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.submap.local_mapping import LocalMapping
-from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
+from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
 _MAX_PREFETCHED_KEYFRAMES = 32
 """Keyframes that are processed ahead at a time."""

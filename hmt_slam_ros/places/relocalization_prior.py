@@ -36,8 +36,8 @@ from hmt_slam_ros.places.observation import (
 )
 from hmt_slam_ros.places.observation_graph import LandmarkSequence, select_landmarks
 from hmt_slam_ros.places.wall_landmarks import KnownLandmarks, known_landmarks_around, wall_landmark_sequence
-from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
+from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
 Pose = Float64
 

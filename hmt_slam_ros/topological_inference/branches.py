@@ -13,8 +13,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, AreaMerge, MovedKeyframe
 from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
-from hmt_slam_ros.topological_inference.global_localization import PoseDistribution
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
+from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
 
 @dataclass(frozen=True, eq=False)

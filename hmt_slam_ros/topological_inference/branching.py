@@ -39,12 +39,7 @@ from hmt_slam_ros.topological_inference.area_comparison import (
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.candidate_gating import Query
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, SearchState
-from hmt_slam_ros.topological_inference.global_localization import (
-    GlobalSearch,
-    LandmarkEvidence,
-    PoseDistribution,
-    PoseHint,
-)
+from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, LandmarkEvidence, PoseHint
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     Lost,
     PoseInArea,
@@ -52,6 +47,7 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import (
     relative_covariance,
 )
 from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingPriors
+from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
 MIN_PROPOSAL_PROBABILITY = 0.5
 """Smallest probability of a hypothesis for which landmarks propose loops."""

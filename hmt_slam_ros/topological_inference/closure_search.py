@@ -48,7 +48,6 @@ from hmt_slam_ros.topological_inference.candidate_gating import (
 from hmt_slam_ros.topological_inference.event_work import CELL_WORK, EventWork
 from hmt_slam_ros.topological_inference.global_localization import (
     GlobalSearch,
-    PoseDistribution,
     PoseHint,
     begin_search,
     check_candidates,
@@ -70,6 +69,7 @@ from hmt_slam_ros.topological_inference.place_recognition import (
     ScanDescriptors,
     best_share,
 )
+from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
 Pose = Float64
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from scipy.special import softmax
 
-from hmt_slam_ros.arrays import Bool, Float64
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
@@ -36,11 +36,9 @@ from hmt_slam_ros.topological_inference.global_scan_matching import (
     region_neighborhood,
 )
 from hmt_slam_ros.topological_inference.place_recognition import PerceptualAliasing
+from hmt_slam_ros.topological_inference.pose_distribution import MIN_PROBABILITY, UNMAPPED_PRIOR, PoseDistribution
 
 Pose = Float64
-
-UNMAPPED_PRIOR = 0.2
-"""Prior probability that a lost robot is on unmapped ground (docs/decisions/0025-global-localization.md)."""
 
 _SURFACE_WEIGHT = 0.5
 """Exponent of the surface likelihood between areas: holes in a map come in lumps, not sample by sample."""
@@ -60,9 +58,6 @@ _MIN_PLAUSIBLE_RATIO = 1e-3
 _HINT_DEVIATIONS = 4.0
 """Deviations of a pose hint beyond which no area is searched."""
 
-_MIN_PROBABILITY = 1e-300
-"""Smallest probability that is not 0, for logarithms."""
-
 
 @dataclass(frozen=True, eq=False)
 class PoseHint:
@@ -76,55 +71,6 @@ class PoseHint:
     keyframe: int
     area: int
     pose: PoseGaussian
-
-
-class PoseDistribution(NamedTuple):
-    """The probability of every pose candidate; the rest is unmapped ground.
-
-    :ivar candidates: ways in which the robot's keyframes lie in the map.
-    :ivar probabilities: shape (len(candidates),).
-    """
-
-    candidates: tuple[PoseCandidate, ...]
-    probabilities: Float64
-
-    @property
-    def best(self) -> tuple[PoseCandidate, float] | None:
-        """The most probable candidate and its probability."""
-        if not self.candidates:
-            return None
-        n = int(self.probabilities.argmax())
-        return self.candidates[n], float(self.probabilities[n])
-
-    def reweight(self, log_weights: Sequence[float] | Float64) -> PoseDistribution:
-        """The distribution after more evidence for every candidate, relative to unmapped ground, nats."""
-        unmapped = max(1.0 - float(self.probabilities.sum()), _MIN_PROBABILITY)
-        logs = np.log(np.maximum(self.probabilities, _MIN_PROBABILITY)) + log_weights
-        shift = max(0.0, float(logs.max(initial=0.0)))
-        weights = np.exp(logs - shift)
-        return PoseDistribution(self.candidates, weights / (weights.sum() + unmapped * math.exp(-shift)))
-
-    def with_unmapped_prior(self, prior: float) -> PoseDistribution:
-        """The distribution for another prior of unmapped ground than ``UNMAPPED_PRIOR``."""
-        weights = (1.0 - prior) / prior * UNMAPPED_PRIOR / (1.0 - UNMAPPED_PRIOR) * self.probabilities
-        unmapped = max(0.0, 1.0 - float(self.probabilities.sum()))
-        return PoseDistribution(self.candidates, weights / max(unmapped + float(weights.sum()), _MIN_PROBABILITY))
-
-    def with_false_alarm(self, at_tracked_pose: Bool, probability: float, areas: int) -> PoseDistribution:
-        """The distribution for a robot that may not have been moved.
-
-        At the tracked pose its scans are as likely as on new ground at least, since furniture may have been moved.
-
-        :param at_tracked_pose: which candidates are the tracked pose, shape (len(candidates),).
-        :param probability: that the robot was not moved.
-        :param areas: number of known areas, over which the prior of a moved robot is flat.
-        """
-        unmapped = max(1.0 - float(self.probabilities.sum()), _MIN_PROBABILITY)
-        moved = UNMAPPED_PRIOR / unmapped * self.probabilities
-        stayed = np.where(at_tracked_pose, areas / (1.0 - UNMAPPED_PRIOR) * moved, 0.0)
-        weights = (1.0 - probability) * moved + probability * stayed
-        rest = (1.0 - probability) * UNMAPPED_PRIOR + probability * max(0.0, 1.0 - float(stayed.sum()))
-        return PoseDistribution(self.candidates, weights / (rest + weights.sum()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,7 +311,7 @@ def _log_weights(
         log_weights.append(log_priors.get(n, log_flat) + log_there + distinctiveness)
         log_chance = max(log_chance, log_there)
     unexamined = (1.0 - UNMAPPED_PRIOR) * sum(search.unexamined.values())
-    log_unexamined = math.log(max(unexamined, _MIN_PROBABILITY)) + log_chance
+    log_unexamined = math.log(max(unexamined, MIN_PROBABILITY)) + log_chance
     return log_weights, float(np.logaddexp(math.log(UNMAPPED_PRIOR), log_unexamined))
 
 
@@ -458,48 +404,3 @@ class LandmarkEvidence(Protocol):
     def forget_scans(self) -> None:
         """Drop what was computed from scans, of which some have changed."""
         ...
-
-
-class LocalizationStatus(NamedTuple):
-    """Whether the robot is localized.
-
-    :ivar localized: whether the lost hypotheses are improbable.
-    :ivar entropy: of the belief over the robot's area, nats; 0 where it is certain.
-    """
-
-    localized: bool
-    entropy: float
-
-
-def summarize_localization(
-    area_probabilities: Mapping[int, float],
-    lost: float,
-    unexamined: float,
-    known: int,
-    distribution: PoseDistribution | None,
-    max_lost_probability: float,
-) -> LocalizationStatus:
-    """The localization status of all hypotheses together.
-
-    :param area_probabilities: {area: probability that a tracked robot is in it}.
-    :param lost: probability of the lost hypotheses.
-    :param unexamined: probability that no hypothesis is right.
-    :param known: number of areas in which a lost robot can be.
-    :param distribution: of the pose of a lost robot; None before the first search.
-    :param max_lost_probability: largest probability of the lost hypotheses of a localized robot.
-    """
-    lost_areas = [lost * probability for probability in _lost_distribution(known, distribution)]
-    probabilities = np.array([*area_probabilities.values(), *lost_areas, unexamined])
-    probabilities = probabilities[probabilities > 0.0]
-    entropy = abs(float(probabilities @ np.log(probabilities)))
-    return LocalizationStatus(lost <= max_lost_probability, entropy)
-
-
-def _lost_distribution(known: int, distribution: PoseDistribution | None) -> list[float]:
-    """The probability of every area and, last, of unmapped ground."""
-    if distribution is None:
-        return [*[(1.0 - UNMAPPED_PRIOR) / max(1, known)] * known, UNMAPPED_PRIOR if known else 1.0]
-    areas: dict[int, float] = {}
-    for candidate, probability in zip(distribution.candidates, distribution.probabilities.tolist(), strict=True):
-        areas[candidate.area] = areas.get(candidate.area, 0.0) + probability
-    return [*areas.values(), max(0.0, 1.0 - sum(areas.values()))]

@@ -24,9 +24,10 @@ from hmt_slam_ros.messages.map_changes import Arc, InitialPose
 from hmt_slam_ros.messages.messages import Keyframe
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.branching import Branching
-from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseDistribution, PoseHint
+from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseHint
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate, is_certain
 from hmt_slam_ros.topological_inference.hypothesis_tree import Lost, PoseInArea, Tracking
+from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
 Pose = Float64
 

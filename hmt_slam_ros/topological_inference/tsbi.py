@@ -29,11 +29,6 @@ from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, GlobalPoses, Replica
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.branching import Branching, BranchingState
-from hmt_slam_ros.topological_inference.global_localization import (
-    LocalizationStatus,
-    PoseDistribution,
-    summarize_localization,
-)
 from hmt_slam_ros.topological_inference.hypothesis_changes import apply_revision, merge_areas
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     HypothesisState,
@@ -46,6 +41,11 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import (
     normalize_and_reduce,
 )
 from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
+from hmt_slam_ros.topological_inference.pose_distribution import (
+    LocalizationStatus,
+    PoseDistribution,
+    summarize_localization,
+)
 from hmt_slam_ros.topological_inference.relocalization import (
     accept_relocalization,
     begin_relocalization,
