@@ -27,5 +27,4 @@ def test_a_laser_with_forty_scans_a_second_is_kept_up_with():
 def test_estimates_do_not_wait_for_slow_topology():
     times = measure_scans(BUSY, 6.0, SLOW_TSBI)
     assert len(times.first.sent) == len(times.final.delays) == len(times.first.delays)
-    assert np.quantile(times.final.delays, 0.9) > 0.5
-    assert np.quantile(times.first.delays, 0.5) < 0.1
+    assert np.median(times.final.delays - times.first.delays) > 0.5

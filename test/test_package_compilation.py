@@ -93,15 +93,17 @@ def test_a_node_says_it_once_and_never_again(tmp_path, listener, start, monkeypa
     from logs_for_nodes import corridor_bag  # noqa: PLC0415  see the import of rclpy in the fixtures
     from std_msgs.msg import String  # noqa: PLC0415
 
-    from hmt_slam_ros.messages.messages import LocalEstimate  # noqa: PLC0415
-    from hmt_slam_ros.ros.topics import CHAIN, DOCUMENTS  # noqa: PLC0415
+    from hmt_slam_ros.messages.messages import EarlyEstimate  # noqa: PLC0415
+    from hmt_slam_ros.ros.topics import DOCUMENTS, STREAM  # noqa: PLC0415
 
     monkeypatch.setenv("NUMBA_CACHE_DIR", cache_without("hmt_slam_ros.sensors.scan", tmp_path / "cache"))
-    log = corridor_bag(tmp_path)
+    scans = 12
+    log, last = corridor_bag(tmp_path, scans), f'"scan_index":{scans - 1},'
     for times in (1, 0):
-        received = listener.subscribe(String, DOCUMENTS[LocalEstimate], CHAIN)
+        early = listener.subscribe(String, DOCUMENTS[EarlyEstimate], STREAM)
         slam = start("slam")
         start("robot", log=log, robot__rate=0.0, robot__flow_control=False)
-        listener.until(lambda received=received: received, seconds=120.0, alive=[slam])
+        # The first scan is estimated, and the others wait for topology: no kernel is left to a start that is quicker.
+        listener.until(lambda early=early: early and last in early[-1].data, seconds=120.0, alive=[slam])
         slam.send_signal(signal.SIGINT)
         assert slam.communicate(timeout=60.0)[1].count("compiling kernels") == times

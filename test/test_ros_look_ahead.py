@@ -110,12 +110,14 @@ def test_of_a_live_laser_fewer_scans_are_accepted_the_more_wait_for_topology(lis
     estimates = [json.loads(message.data) for message in nodes.estimates]
     assert [estimate["scan_index"] for estimate in estimates] == list(range(accepted))
     steps = np.diff([estimate["stamp"] for estimate in estimates]) // robot.PERIOD
-    # DDS may have lost some.
-    assert [part[4:].min() for part in np.split(steps[: WAITING - 4], 4)] == SPACINGS
+    least = np.array([part[4:].min() for part in np.split(steps[: WAITING - 4], 4)])
+    assert (least >= SPACINGS).all(), least
+    # Every second one at most was lost by DDS.
+    assert (least <= 2 * np.array(SPACINGS)).all(), least
     # It has caught up, and accepts all.
     nodes.until(lambda: robot.send() and len(nodes.estimates) > accepted + 20)
     stamps = [json.loads(message.data)["stamp"] for message in nodes.estimates[accepted + 1 :]]
-    assert np.diff(stamps).min() == robot.PERIOD
+    assert np.diff(stamps).min() <= 2 * robot.PERIOD
 
 
 def assert_true_pose(estimate):
