@@ -56,6 +56,7 @@ def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corr
     nodes.park()
     little = listener.call(GetMap, "tlca/get_map", GetMap.Request()).map
     assert count_occupied(little) > 20
+    nodes.until(lambda: nodes.localized)
 
     assert load(listener, tmp_path / "nowhere").result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
     shutil.copytree(out / "hmt_map", tmp_path / "damaged")
