@@ -11,11 +11,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from hmt_slam_ros.compilation import declared_kernels
 from hmt_slam_ros.kernel_table import KernelCall, known_calls
+from hmt_slam_ros.process_table import COMPANIONS, PROCESSES
 
 _PRIOR = 1.0
 """Time of compilation, s, as which it counts that this machine is as fast as that of the table."""
@@ -51,7 +53,10 @@ class KernelLoading:
         self._begin = None
 
     def load_cached(self) -> list[KernelCall]:
-        """Load what is cached; returns the calls of the kernels that are not."""
+        """Load what is cached, and the node's libraries; returns the calls of the kernels that are not."""
+        for row in (*PROCESSES, *COMPANIONS):
+            for library in row.libraries if row.name == self._user else ():
+                import_module(library)
         missing = []
         for call in self._calls():
             if _is_cached(call):

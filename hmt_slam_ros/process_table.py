@@ -33,12 +33,14 @@ class NodeRow:
     :ivar title: its purpose in a few words.
     :ivar node_class: "module:Class" of the node, made with its name and run by ``spin``; empty without an executable.
     :ivar consumes: names of the message classes that it receives.
+    :ivar libraries: parts of scipy that are imported at the first call of a function, or ahead with the kernels.
     """
 
     name: str
     title: str
     node_class: str = ""
     consumes: tuple[str, ...] = ()
+    libraries: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
         consumes=("Keyframe", "Hypotheses", "ClosureDecision"),
         factory=f"{_COMPOSITION}:area_abstraction",
         state="hmt_slam_ros.area_abstraction.partition:AamState",
+        libraries=("scipy.linalg", "scipy.sparse.csgraph"),
         produces=("AreaEvents",),
     ),
     ProcessRow(
@@ -117,6 +120,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
         consumes=("TrackingReset", "Keyframe", "AreaEvents", "ClosureDecision"),
         factory=f"{_COMPOSITION}:topological_inference",
         state="hmt_slam_ros.topological_inference.tsbi:TsbiState",
+        libraries=("scipy.special",),
         produces=("Hypotheses",),
     ),
     ProcessRow(
@@ -126,6 +130,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
         consumes=("Keyframe", "Hypotheses"),
         factory="hmt_slam_ros.loop_closure.tlca:Tlca",
         state="hmt_slam_ros.loop_closure.tlca:TlcaState",
+        libraries=("scipy.sparse.csgraph", "scipy.sparse.linalg"),
         produces=("ClosureDecision",),
     ),
     ProcessRow(

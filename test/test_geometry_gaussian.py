@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.stats import chi2
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, fuse, match_moments
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, chi_square_quantile, fuse, match_moments
 
 SAMPLES = 200_000
 
@@ -201,6 +201,11 @@ def test_fusion_never_adds_uncertainty(seed):
 @pytest.mark.parametrize("probability", [0.5, 0.95, 0.999])
 def test_the_gate_is_the_quantile_of_chi_square(probability):
     assert chi_square_gate(probability) == pytest.approx(chi2.ppf(probability, 3), rel=1e-12)
+
+
+@pytest.mark.parametrize("probability", [0.95, 0.99, 0.999])
+def test_the_gates_that_are_constants_are_those_that_scipy_computes(probability):
+    assert chi_square_gate(probability) == pytest.approx(chi_square_quantile(probability, 3), rel=1e-15)
 
 
 def test_the_ellipse_holds_95_percent_of_the_positions_in_the_outer_axes():

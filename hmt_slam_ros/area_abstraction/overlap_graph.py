@@ -20,9 +20,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import eigh
-from scipy.sparse.csgraph import connected_components
 
 from hmt_slam_ros.arrays import Bool, Float64, Int32, Int64
 from hmt_slam_ros.compilation import njit
@@ -262,8 +261,9 @@ def _orders(similarity: Float64) -> list[NDArray[np.intp]]:
     # x = D^-1/2 y with y an eigenvector of the symmetric I - D^-1/2 A D^-1/2.
     laplacian = np.eye(n) - scale[:, None] * joined * scale
     # Each component beyond the first has an eigenvalue near 0; the next solution bisects a component.
-    last = min(n - 1, connected_components(similarity > 0.0, directed=False)[0] + 1)
-    vectors = eigh(laplacian, subset_by_index=(0, last))[1]
+    components = scipy.sparse.csgraph.connected_components(similarity > 0.0, directed=False)[0]
+    last = min(n - 1, components + 1)
+    vectors = scipy.linalg.eigh(laplacian, subset_by_index=(0, last))[1]
     return [np.argsort(scale * vector, kind="stable") for vector in vectors.T]
 
 

@@ -11,12 +11,10 @@ One node is fixed; the marginal covariances are relative to it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import csc_matrix, diags
-from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import SuperLU, splu
+import scipy
 
 from hmt_slam_ros.arrays import Float64, Int32, Int64
 from hmt_slam_ros.compilation import njit
@@ -149,14 +147,14 @@ def sparsity_pattern(rows: Int64, columns: Int64, nodes: int) -> SparsityPattern
     return SparsityPattern(indices, starts, first, stride)
 
 
-def normal_matrix(pattern: SparsityPattern, of_source: Float64, of_target: Float64, information: Float64) -> csc_matrix:
+def normal_matrix(pattern: SparsityPattern, of_source: Float64, of_target: Float64, information: Float64) -> Any:  # noqa: ANN401  csc_matrix
     """The sum of J^T Omega J over all edges.
 
     :param information: shape (m, 3, 3), of the edges.
     """
     size = len(pattern.starts) - 1
     entries = _entries(pattern.first, pattern.stride, len(pattern.indices), of_source, of_target, information)
-    return csc_matrix((entries, pattern.indices, pattern.starts), shape=(size, size))
+    return scipy.sparse.csc_matrix((entries, pattern.indices, pattern.starts), shape=(size, size))
 
 
 @njit(cache=True)
@@ -310,8 +308,9 @@ class _System:
 
     def _require_connected(self, fixed: int) -> None:
         ones = np.ones(len(self._edges.sources))
-        graph = csc_matrix((ones, (self._edges.sources, self._edges.targets)), shape=(self._nodes, self._nodes))
-        labels = connected_components(graph, directed=False)[1]
+        ends, shape = (self._edges.sources, self._edges.targets), (self._nodes, self._nodes)
+        graph = scipy.sparse.csc_matrix((ones, ends), shape=shape)
+        labels = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
         isolated = np.flatnonzero(labels != labels[fixed])
         if isolated.size:
             raise ValueError(
@@ -335,12 +334,13 @@ class _System:
             step[self._free] = -self._factor(state, damping).solve(gradient[self._free].ravel()).reshape(-1, 3)
         return step
 
-    def _factor(self, state: _State, damping: float) -> SuperLU:
+    def _factor(self, state: _State, damping: float) -> Any:  # noqa: ANN401  SuperLU, of scipy, which has no types
         hessian = normal_matrix(self._pattern, state.of_source, state.of_target, self._information)
         if damping > 0.0:
-            hessian = (hessian + diags(damping * hessian.diagonal())).tocsc()
+            hessian = (hessian + scipy.sparse.diags(damping * hessian.diagonal())).tocsc()
         # Symmetric and positive definite: no pivoting, so that the fill follows the graph.
-        return splu(hessian, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        options = {"SymmetricMode": True}
+        return scipy.sparse.linalg.splu(hessian, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
 
     def marginals(self, state: _State) -> Float64:
         """The diagonal blocks of the inverse of the normal matrix, shape (n, 3, 3); zero for the fixed node."""

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.sparse import csc_matrix
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration import Configuration
@@ -157,8 +156,8 @@ def _connected_groups(hybrid_map: HybridMap, closed: Collection[int]) -> list[li
     """The closed areas and those one arc away, in groups that arcs connect, each ascending."""
     arcs = np.array([(area, other) for area in closed for other in (area, *connected_neighbors(hybrid_map, area))])
     areas, rows = np.unique(arcs, return_inverse=True)
-    graph = csc_matrix((np.ones(len(arcs)), rows.reshape(-1, 2).T), shape=(areas.size, areas.size))
-    groups, labels = connected_components(graph, directed=False)
+    graph = scipy.sparse.csc_matrix((np.ones(len(arcs)), rows.reshape(-1, 2).T), shape=(areas.size, areas.size))
+    groups, labels = scipy.sparse.csgraph.connected_components(graph, directed=False)
     return [areas[labels == group].tolist() for group in range(groups)]
 
 

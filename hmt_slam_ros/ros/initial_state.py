@@ -127,7 +127,9 @@ class InitialState:
     @cached_property
     def map(self) -> MapDocument | None:
         """The map itself, None without."""
-        from hmt_slam_ros.results.hmt_map import MapDocument  # noqa: PLC0415
+        if self._reader is None:
+            return None
+        from hmt_slam_ros.results.hmt_map import MapDocument  # noqa: PLC0415  it loads all processes
 
         return self.read_part("map", MapDocument)
 

@@ -14,7 +14,7 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtri
+import scipy
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
 from hmt_slam_ros.compilation import njit
@@ -269,7 +269,7 @@ def _normal_points() -> Float64:
     """
     g = 1.2207440846057596
     steps = np.arange(_DRAWS)[:, None] / g ** np.arange(1, 4)
-    return np.asarray(ndtri((0.5 + steps) % 1.0), dtype=np.float64)
+    return np.asarray(scipy.special.ndtri((0.5 + steps) % 1.0), dtype=np.float64)
 
 
 def quick_entry_bounds(

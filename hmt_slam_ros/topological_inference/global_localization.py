@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from scipy.special import softmax
+import scipy
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
@@ -326,7 +326,7 @@ def _other_shares(search: GlobalSearch) -> list[float]:
 
 def _probabilities(log_weights: Sequence[float], log_rest: float) -> Float64:
     """Probabilities of candidates beside the rest, shape (len(log_weights),)."""
-    return np.asarray(softmax(np.array([*log_weights, log_rest]))[:-1], dtype=np.float64)
+    return np.asarray(scipy.special.softmax(np.array([*log_weights, log_rest]))[:-1], dtype=np.float64)
 
 
 def _areas_near_hint(hybrid_map: HybridMap, pose_hint: PoseHint, radius: float, before: int) -> dict[int, PoseGaussian]:

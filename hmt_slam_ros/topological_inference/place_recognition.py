@@ -19,7 +19,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import softmax
+import scipy
 
 from hmt_slam_ros.arrays import Bool, Float32, Float64
 from hmt_slam_ros.compilation import njit
@@ -142,7 +142,7 @@ class ScanDescriptors:
         :param areas: {area: its keyframes, at least one}.
         """
         similarity = self.similarity(keyframes, list(areas.values()))
-        probabilities = softmax(descriptor_log_ratio(similarity)) if areas else similarity
+        probabilities = scipy.special.softmax(descriptor_log_ratio(similarity)) if areas else similarity
         return dict(zip(areas, probabilities.tolist(), strict=True))
 
     def _stack(self, keyframes: Collection[int]) -> Float64:
