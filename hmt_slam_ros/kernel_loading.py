@@ -19,6 +19,8 @@ from hmt_slam_ros.compilation import declared_kernels
 from hmt_slam_ros.kernel_table import KernelCall, known_calls
 from hmt_slam_ros.process_table import COMPANIONS, PROCESSES
 
+COMPILING = "compiling kernels"
+"""Beginning of the progress, in diagnostics and on a terminal."""
 _PRIOR = 1.0
 """Time of compilation, s, as which it counts that this machine is as fast as that of the table."""
 _PLUG_INS = ("hmt_slam_ros.landmarks.", "hmt_slam_ros.places.")
@@ -31,7 +33,9 @@ class KernelLoading:
     """Loads the kernels that a node calls, or all.
 
     Processes that compile at the same time take turns at the kernels of a module, and each finds those of the others
-    in the cache.
+    in the cache. It may run in a thread, while others read the time left.
+
+    :ivar is_stopped: set to end after the current kernel.
     """
 
     def __init__(self, user: str | None = None, clock: Callable[[], float] = time.monotonic) -> None:
@@ -39,6 +43,7 @@ class KernelLoading:
 
         :param clock: returns seconds since any start.
         """
+        self.is_stopped = False
         self._user, self._clock = user, clock
         self._begin: float | None = None
         self._done = self._pending = 0.0
@@ -59,6 +64,8 @@ class KernelLoading:
                 import_module(library)
         missing = []
         for call in self._calls():
+            if self.is_stopped:
+                break
             if _is_cached(call):
                 _load(call, may_wait=True)
             else:
@@ -76,16 +83,24 @@ class KernelLoading:
         self._begin = self._clock()
         self._pending = sum(call.seconds for call in missing)
         passed_over = 0
-        while missing:
+        while missing and not self.is_stopped:
             call = missing.popleft()
             self._current, self._current_begin = call.seconds, self._clock()
             on_progress()
             if _load(call, may_wait=passed_over >= len(missing)):
                 self._pending, self._done = self._pending - call.seconds, self._done + call.seconds
+                self._load_compiled_elsewhere(missing)
                 passed_over = 0
             else:
                 missing.append(call)
                 passed_over += 1
+
+    def _load_compiled_elsewhere(self, missing: deque[KernelCall]) -> None:
+        """Load the kernels that other processes have compiled meanwhile; they say nothing about the pace."""
+        for call in [call for call in missing if _is_cached(call)]:
+            _load(call, may_wait=True)
+            missing.remove(call)
+            self._pending -= call.seconds
 
     @property
     def seconds_left(self) -> float | None:
@@ -100,7 +115,7 @@ class KernelLoading:
     def progress(self) -> str:
         """What is compiled and the time left, in words; empty where nothing is."""
         left = self.seconds_left
-        return "" if left is None else f"compiling kernels, {max(round(left), 1)} s left"
+        return "" if left is None else f"{COMPILING}, {max(round(left), 1)} s left"
 
 
 def count_loaded() -> dict[str, int]:

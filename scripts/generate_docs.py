@@ -160,7 +160,7 @@ _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
         *("pose", "hmt/pose", "hmt/graph", "map", "hmt/keyframes", "hmt/hypotheses", "hmt/is_localized"),
         *("hmt/entropy", "hmt/robot_status", "diagnostics"),
     ),
-    "robot": ("hmt/local_estimate", "hmt/tracking_reset"),
+    "robot": ("hmt/local_estimate", "hmt/tracking_reset", "diagnostics"),
     "explorer": ("hmt/reset_request", "tf_static"),
     "pilot": ("hmt/reset_request", "tf_static"),
     "recorder": ("hmt/area_events", "hmt/robot_status", "diagnostics", "hmt/cost"),

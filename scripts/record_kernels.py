@@ -42,6 +42,9 @@ COMMANDS: tuple[tuple[str, ...], ...] = (
 )
 """Commands; ``{out}`` is the folder of the last one that mapped without --from."""
 
+FOR_SUBSCRIBERS = {"hmt_slam_ros.grids.occupancy_map:_vote": "tlca"}
+"""{kernel: node} of what a node calls only for subscribers of a topic."""
+
 Calls = dict[tuple[str, str], set[str]]
 """{("module:name", types of the arguments): users}."""
 
@@ -63,6 +66,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         record_commands(Path(folder), calls)
         record_program(Path(folder), calls, "command", "replay", BUNDLED, "--out", f"{folder}/replay")
+    for (kernel, _), users in calls.items():
+        users.update([FOR_SUBSCRIBERS[kernel]] if kernel in FOR_SUBSCRIBERS else [])
     write_table(calls)
 
 

@@ -1,6 +1,7 @@
 """That kernels are being compiled is reported where it is so, and only there."""
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -89,17 +90,19 @@ def test_every_kernel_that_maps_a_log_is_in_the_cache_afterwards(tmp_path):
     assert count_reports("map", log, "--out", tmp_path / "out", environment=os.environ) == 0
 
 
-def test_a_node_says_it_once_and_never_again(tmp_path, listener, start, monkeypatch):
-    from logs_for_nodes import corridor_bag  # noqa: PLC0415  see the import of rclpy in the fixtures
+def test_a_node_says_it_once_and_sends_the_time_left_as_no_alarm(tmp_path, listener, start, monkeypatch):
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: PLC0415  see the import of rclpy
+    from logs_for_nodes import corridor_bag  # noqa: PLC0415
     from std_msgs.msg import String  # noqa: PLC0415
 
     from hmt_slam_ros.messages.messages import EarlyEstimate  # noqa: PLC0415
-    from hmt_slam_ros.ros.topics import DOCUMENTS, STREAM  # noqa: PLC0415
+    from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, STREAM  # noqa: PLC0415
 
     monkeypatch.setenv("NUMBA_CACHE_DIR", cache_without("hmt_slam_ros.sensors.scan", tmp_path / "cache"))
     scans = 12
     log, last = corridor_bag(tmp_path, scans), f'"scan_index":{scans - 1},'
     for times in (1, 0):
+        reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, STREAM)
         early = listener.subscribe(String, DOCUMENTS[EarlyEstimate], STREAM)
         slam = start("slam")
         start("robot", log=log, robot__rate=0.0, robot__flow_control=False)
@@ -107,3 +110,8 @@ def test_a_node_says_it_once_and_never_again(tmp_path, listener, start, monkeypa
         listener.until(lambda early=early: early and last in early[-1].data, seconds=120.0, alive=[slam])
         slam.send_signal(signal.SIGINT)
         assert slam.communicate(timeout=60.0)[1].count("compiling kernels") == times
+        statuses = [status for message in reported for status in message.status if status.name == "/slam"]
+        assert {status.level for status in statuses} <= {DiagnosticStatus.OK}
+        progress = [status.message for status in statuses if status.message.startswith("compiling kernels, ")]
+        assert bool(progress) == bool(times)
+        assert all(re.fullmatch(r"compiling kernels, \d+ s left", text) for text in progress)

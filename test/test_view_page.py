@@ -241,6 +241,7 @@ def test_a_node_that_is_missing_or_fell_silent_is_named():
     health = SystemHealth(NODES)
     health.update("slam", 0, "running", {}, 0.0)
     assert health.verdict(1.0)["text"] == "rtl is not running."
+    assert [health.verdict(now)["level"] for now in (1.0, 10.5)] == ["waiting", "fault"]
     well(health, 2.0)
     health.update("slam", 0, "running", {}, 20.0)
     assert health.verdict(20.5) | {"advice": ""} == {
@@ -288,6 +289,21 @@ def test_a_node_that_is_halted_is_named_rather_than_the_pose_that_does_not_come(
     assert health.rows(1.0)[1]["level"] == "waiting"
     health.update("rtl", 0, "running", {"state": "active"}, 1.0)
     assert "no pose came yet" in health.verdict(2.0)["text"]
+
+
+def test_nodes_that_compile_are_no_alarm_and_the_longest_time_left_is_shown():
+    health = SystemHealth(NODES)
+    for name, left in zip(NODES, (12, 40), strict=True):
+        text = f"compiling kernels, {left} s left"
+        health.update(name, 0, text, {"state": "inactive", "kernels": text}, 0.0)
+    assert health.verdict(1.0)["level"] == "waiting"
+    assert health.verdict(1.0)["text"] == "rtl and slam: compiling kernels, 40 s left."
+    assert [(row["level"], row["message"]) for row in health.rows(1.0)] == [
+        ("waiting", "compiling kernels, 12 s left"),
+        ("waiting", "compiling kernels, 40 s left"),
+    ]
+    health.update("rtl", 0, "inactive", {"state": "inactive", "kernels": "63 loaded"}, 1.0)
+    assert health.verdict(1.0)["text"] == "slam: compiling kernels, 12 s left."
 
 
 def test_errors_come_before_warnings_and_warnings_grow_old():

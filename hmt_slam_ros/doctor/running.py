@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from hmt_slam_ros.doctor.finding import Finding, Severity, times_text
+from hmt_slam_ros.kernel_loading import COMPILING
 from hmt_slam_ros.process_table import COORDINATOR, process_names, topic_of
 
 OUR_NODES = process_names()
@@ -134,15 +135,23 @@ def _check_states(running: RunningSystem) -> Iterator[Finding]:
             verbs = f"is {state} and takes" if len(names) == 1 else f"are {state} and take"
             text = f"{_join_names(names)} {verbs} no part: {remedy.format(first=names[0], others=others)}."
             yield Finding("wrong", "states", text)
+    texts = [f"{status.name}: {status.message}" for status in running.diagnostics if _is_compiling(status)]
+    if texts:
+        text = f"{'; '.join(texts)}. That is so once on a computer: wait, and run hmt_slam compile at the installation."
+        yield Finding("fine", "kernels", text)
 
 
 def _nodes_in_state(running: RunningSystem, state: str) -> list[str]:
-    """Names of our nodes in a lifecycle state, with their namespaces."""
+    """Names of our nodes in a lifecycle state, with their namespaces, but those that compile."""
     return sorted(
         status.name
         for status in running.diagnostics
-        if status.state == state and status.name.rpartition("/")[2] in OUR_NODES
+        if status.state == state and status.name.rpartition("/")[2] in OUR_NODES and not _is_compiling(status)
     )
+
+
+def _is_compiling(status: NodeStatus) -> bool:
+    return status.message.startswith(COMPILING)
 
 
 def _check_silence(running: RunningSystem, *, all_active: bool) -> Iterator[Finding]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -28,6 +28,12 @@ STATE, ACTIVE = "state", "active"
 """Key of the lifecycle state in /diagnostics, and its value for an active node."""
 SYSTEM, SECOND_SYSTEM = "system", "second system"
 """Keys of the name of a node's system in /diagnostics, and of another system that speaks on its topics."""
+KERNELS = "kernels"
+"""Key of the kernels of a node in /diagnostics: how long they are compiled yet, or how many are loaded."""
+LOADING = ("compiling", "loading")
+"""Beginnings of that value before the kernels are loaded."""
+HARDWARE_ID = "hmt_slam_ros"
+"""Name in /diagnostics by which the nodes of the package are known."""
 _MAX_CAUSES = 20
 """Different causes of refusals on a topic that are logged; more are only counted."""
 _MAX_SENTENCE = 400
@@ -42,6 +48,8 @@ class NodeDiagnostics:
     :ivar received: {message type: count}.
     :ivar sent: {message type: count}.
     :ivar values: further entries, {name: value}.
+    :ivar kernels: describes the kernels of the node for an entry; empty for none.
+    :ivar progress: describes what has to be done before the node can process messages; empty without.
     :ivar system: the system that the node belongs to.
     :ivar crowded_topic: a topic with more publishers than one system has, and their number; empty without.
     :ivar steady_clock: clock for timers that run while simulated time stands still.
@@ -49,6 +57,8 @@ class NodeDiagnostics:
 
     def __init__(self, node: Node, system: SystemName) -> None:
         self._node, self.system, self.crowded_topic = node, system, ""
+        self.kernels: Callable[[], str] = str
+        self.progress: Callable[[], str] = str
         self.clear()
         self._clock = Clock(clock_type=ClockType.SYSTEM_TIME)
         self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
@@ -140,7 +150,7 @@ class NodeDiagnostics:
         values = {
             **self._counts_and_rates(),
             **self.values,
-            **self._system_values(),
+            **self._optional_values(),
             "messages handled": self._handled,
             "busy": f"{self._busy_seconds:.3f} s",
             "longest message": f"{1e3 * self._longest:.1f} ms",
@@ -151,17 +161,24 @@ class NodeDiagnostics:
         status = DiagnosticStatus(
             level=self._level,
             name=self._node.get_fully_qualified_name(),
-            message=self._error or self._status_text,
-            hardware_id="hmt_slam_ros",
+            message=self._error or self.progress() or self._status_text,
+            hardware_id=HARDWARE_ID,
             values=[KeyValue(key=name, value=str(value)) for name, value in values.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._clock.now().to_msg()
         self._publisher.publish(message)
 
-    def _system_values(self) -> dict[str, object]:
-        """The system of the node, and another one that speaks on its topics; an entry only where there is one."""
-        values = {SYSTEM: self.system.name, SECOND_SYSTEM: self.system.other or self.crowded_topic}
+    def _optional_values(self) -> dict[str, object]:
+        """The system of the node, another one that speaks on its topics, and kernels; an entry where there is one.
+
+        They outlast :meth:`clear`.
+        """
+        values = {
+            SYSTEM: self.system.name,
+            SECOND_SYSTEM: self.system.other or self.crowded_topic,
+            KERNELS: self.kernels(),
+        }
         return {key: value for key, value in values.items() if value}
 
     @property

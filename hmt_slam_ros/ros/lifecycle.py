@@ -9,18 +9,25 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState
 from rclpy.lifecycle.node import TransitionCallbackReturn
+from rclpy.task import Future
 from rclpy.time_source import CLOCK_TOPIC
 
+from hmt_slam_ros.compilation import report_compilation
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.system_name import SystemName
 from hmt_slam_ros.ros.diagnostics import STATE, NodeDiagnostics
+from hmt_slam_ros.ros.kernel_thread import KernelThread
 from hmt_slam_ros.ros.parameters import ConfiguredNode
 
+_POLL = 0.02
+"""Time between two checks whether the kernels are loaded, s."""
 _AUTOSTART = ParameterDescriptor(
     description="Whether the node configures and activates itself; otherwise it waits for a lifecycle manager.",
     read_only=True,
@@ -33,11 +40,15 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
     :ivar diagnostics: counts and faults, also while the node is unconfigured.
     :ivar is_configured: whether the node is inactive or active.
     :ivar is_active: whether the node is active.
+    :ivar kernels: the thread that loads the kernels, started by ``configure``.
     """
 
     def __init__(self, name: str) -> None:
         """Declare the parameters; with an invalid one the node can never be configured."""
         self.is_configured = self.is_active = False
+        self.kernels, self._loading_timer = KernelThread(name), None
+        self._kernels_loaded = Future()
+        self._activates_itself = False
         self._fault: Exception | None = None
         self._parameter_fault: HmtSlamError | None = None
         self.system = SystemName()
@@ -48,7 +59,9 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
             self._parameter_fault = fault
         self._autostart = bool(self.declare_parameter("autostart", True, _AUTOSTART).value)
         self.diagnostics = NodeDiagnostics(self, self.system)
-        LifecycleNodeMixin.__init__(self)
+        self.diagnostics.kernels, self.diagnostics.progress = self.kernels.describe, lambda: self.kernels.progress
+        # So that other requests are answered while one waits for the kernels; all of them run in one thread.
+        LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._handle_change_state
         self._permanent_entities = set(self._entities())
@@ -95,22 +108,49 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         return self._autostart, self._autostart
 
     def enter_startup_states(self) -> None:
-        """Make the transitions of startup.
+        """Make the transitions of startup; the second one comes when the kernels are loaded.
 
-        :raises HmtSlamError: where one fails.
+        :raises HmtSlamError: where the first one fails.
         """
         if self._parameter_fault is not None and self._autostart:
             raise self._parameter_fault
         configure, activate = (False, False) if self._parameter_fault else self.startup_states
-        for is_wanted, trigger in ((configure, self.trigger_configure), (activate, self.trigger_activate)):
-            if is_wanted:
-                trigger()
-                self._update_state()
-                if self._fault is not None:
-                    raise self._fault
+        if configure:
+            self._activates_itself = activate
+            self._make_startup_transition(self.trigger_configure)
+
+    def _make_startup_transition(self, trigger: Callable[[], object]) -> None:
+        trigger()
+        self._update_state()
+        if self._fault is not None:
+            raise self._fault
+
+    def _load_kernels(self) -> None:
+        """Load the kernels of what is configured, while the node spins."""
+        report_compilation(self.get_logger().info)
+        self._kernels_loaded = Future()
+        self.kernels.start()
+        self._loading_timer = self.create_timer(_POLL, self._check_kernels, clock=self.diagnostics.steady_clock)
+
+    def _check_kernels(self) -> None:
+        """Go on with the startup, and answer who waits, where the kernels are loaded."""
+        if not self.kernels.is_done:
+            return
+        self._stop_loading()
+        if self._activates_itself and self.is_configured and not self.is_active:
+            self._make_startup_transition(self.trigger_activate)
+        self._activates_itself = False
+
+    def _stop_loading(self) -> None:
+        self.kernels.stop()
+        if self._loading_timer is not None:
+            self.destroy_timer(self._loading_timer)
+            self._loading_timer = None
+            self._kernels_loaded.set_result(None)
 
     def tear_down(self) -> None:
         """Destroy all that was made after the constructor."""
+        self._stop_loading()
         self.clean_up_node()
         self.is_configured = self.is_active = False
         self._destroy_configured_entities()
@@ -145,6 +185,7 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
             self.abandon_configuration()
             raise
         self.is_configured = True
+        self._load_kernels()
 
     def _activate(self) -> None:
         self.is_active = True
@@ -171,10 +212,26 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
 
-    def _handle_change_state(
+    async def _handle_change_state(
         self, request: ChangeState.Request, response: ChangeState.Response
     ) -> ChangeState.Response:
-        """Answer the service ``change_state``; refuse an unknown transition, and raise a programming error."""
+        """Answer the service ``change_state``; refuse an unknown transition, and raise a programming error.
+
+        The answer to ``configure``, and an activation, wait until the kernels are loaded.
+        """
+        transition = request.transition
+        if _is_transition(transition, Transition.TRANSITION_ACTIVATE, "activate"):
+            await self._wait_for_kernels()
+        self._change_state_now(request, response)
+        if response.success and _is_transition(transition, Transition.TRANSITION_CONFIGURE, "configure"):
+            await self._wait_for_kernels()
+        return response
+
+    async def _wait_for_kernels(self) -> None:
+        if self._loading_timer is not None:
+            await self._kernels_loaded
+
+    def _change_state_now(self, request: ChangeState.Request, response: ChangeState.Response) -> None:
         self._fault = None
         try:
             self._change_state(request, response)
@@ -185,7 +242,6 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
             self.diagnostics.fail(str(self._fault))
         elif self._fault is not None:
             raise self._fault
-        return response
 
     @property
     def state(self) -> str:
@@ -194,6 +250,7 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
 
     def destroy_node(self) -> None:
         """Destroy the node with its lifecycle services and publisher, which rclpy does not count to the node."""
+        self.kernels.stop()
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()
 
@@ -215,3 +272,8 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
                 # rclpy makes it when use_sim_time is set.
                 if getattr(entity, "topic_name", "") != CLOCK_TOPIC:
                     destroy(entity)
+
+
+def _is_transition(transition: Transition, number: int, label: str) -> bool:
+    """Whether a request is for a transition, which it names by its label, or else by its number."""
+    return bool(transition.label == label if transition.label else transition.id == number)

@@ -17,7 +17,6 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
 from rclpy.signals import uninstall_signal_handlers
 
-from hmt_slam_ros.compilation import report_compilation
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import as_flat
 from hmt_slam_ros.errors import HmtSlamError
@@ -134,7 +133,6 @@ class ProcessNode(ParticipantNode):
         self.process = self._create_process(self.initial_state)
         if recovered is None:
             self._start_journal()
-        report_compilation(self.get_logger().info)
         self.outbox = Outbox(self, self._output_types, self.reset_number)
         self.inbox = Inbox(
             self,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry as OdometryMessage
 from numpy.typing import NDArray
@@ -36,13 +37,14 @@ from hmt_slam_ros.messages.messages import LocalEstimate, Message, TrackingReset
 from hmt_slam_ros.open_log import is_simulated, open_log
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.chain_writer import publish_reliably
-from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
+from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, KERNELS, LOADING, NodeDiagnostics
 from hmt_slam_ros.ros.message_io import Inbox
 from hmt_slam_ros.ros.parameters import ConfiguredNode, declare_frame
 from hmt_slam_ros.ros.player import Player
 from hmt_slam_ros.ros.topics import (
     CLOCK,
     CMD_VEL,
+    DIAGNOSTICS,
     DOCUMENTS,
     GROUND_TRUTH,
     ODOM,
@@ -160,8 +162,16 @@ class RobotNode(ConfiguredNode):
         self._send_static_transforms = transform_publisher(self, "tf_static")
         # With the past: the first estimates may come before the two nodes have found each other.
         self._inbox = Inbox(self, (LocalEstimate, TrackingReset), self._on_message, self.diagnostics, topics.CHAIN)
+        self.create_subscription(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, topics.STREAM)
         self.create_service(SetBool, "~/pause", self._pause)
         self.create_timer(_STATUS_PERIOD, self._publish_status, clock=self.diagnostics.steady_clock)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        """Wait for nodes that load or compile their kernels as long as they do."""
+        for status in message.status:
+            for value in status.values if status.hardware_id == HARDWARE_ID else ():
+                if value.key == KERNELS and value.value.startswith(LOADING):
+                    self._started_at = time.monotonic()
 
     def _open_log(self) -> Log:
         descriptor = ParameterDescriptor(description="The log to replay, or sim:WORLD.", read_only=True)

@@ -9,7 +9,6 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
-from hmt_slam_ros.compilation import report_compilation
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -109,7 +108,6 @@ class TaskNode(ManagedNode):
         self._gap_checks = 0
         initial_state = InitialState(self, self._start_from, lost=True)
         self._process = self.make_process(initial_state)
-        report_compilation(self.get_logger().info)
         self._commands = self.create_publisher(Twist, CMD_VEL, topics.STREAM) if self.is_driver else None
         self._result_publisher = self.create_publisher(String, TASK_RESULTS[self._name], topics.LATCHED)
         self._goals = self.create_publisher(PoseStamped, GOAL_POSE, topics.STREAM)

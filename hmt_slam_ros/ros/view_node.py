@@ -22,7 +22,7 @@ from hmt_slam_ros.messages.documents import KeyframeHeader, RobotStatus
 from hmt_slam_ros.messages.messages import Hypotheses
 from hmt_slam_ros.process_table import process_names, producer
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.diagnostics import SYSTEM, NodeDiagnostics
+from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, SYSTEM, NodeDiagnostics
 from hmt_slam_ros.ros.guarded_node import GuardedNode
 from hmt_slam_ros.ros.message_io import document_callback
 from hmt_slam_ros.ros.parameters import declare_system
@@ -215,7 +215,7 @@ class ViewNode(GuardedNode):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.hardware_id == "hmt_slam_ros":
+            if status.hardware_id == HARDWARE_ID:
                 values = {entry.key: entry.value for entry in status.values}
                 if SYSTEM in values:  # a node that has received no document yet has none
                     self.diagnostics.system.admit(values[SYSTEM])

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, Literal
 
+from hmt_slam_ros.kernel_loading import COMPILING
 from hmt_slam_ros.messages.system_name import REMEDY
 
 Level = Literal["good", "waiting", "attention", "fault"]
 
 _NODE_TIMEOUT = 10.0
-"""Time without diagnostics after which a node is silent, s. They come once a second; compiling a kernel delays them."""
+"""Time without diagnostics after which a node is silent, s; each has as long to start. They come once a second."""
 
 _POSE_TIMEOUT = 3.0
 """Time without a pose that is a fault, s."""
@@ -35,6 +37,9 @@ _WARN = 1
 
 _SECOND_SYSTEM = "second system"
 """Name of the value by which a node reports another system on its topics."""
+
+_KERNELS = "kernels"
+"""Name of the value that describes the kernels of a node."""
 
 _ACTIVE = "active"
 """Lifecycle state of a node that processes messages."""
@@ -121,6 +126,7 @@ class SystemHealth:
             self._no_nodes_verdict(),
             self._silent_nodes_verdict(now),
             diagnostics.get("fault"),
+            self._compiling_nodes_verdict(),
             self._inactive_nodes_verdict(),
             self._pose_verdict(now),
             self._second_system_verdict(),
@@ -147,16 +153,26 @@ class SystemHealth:
     def _silent_nodes_verdict(self, now: float) -> dict[str, str] | None:
         never = [name for name in self.expected_nodes if name not in self.nodes]
         if never:
+            level: Level = "fault" if now > _NODE_TIMEOUT else "waiting"
             verb = "is" if len(never) == 1 else "are"
-            return _verdict("fault", f"{_join_names(never)} {verb} not running.", f"ros2 run hmt_slam_ros {never[0]}")
+            return _verdict(level, f"{_join_names(never)} {verb} not running.", f"ros2 run hmt_slam_ros {never[0]}")
         silent = [name for name in self.expected_nodes if now - self.nodes[name].heard_at > _NODE_TIMEOUT]
         if not silent:
             return None
         age = now - min(self.nodes[name].heard_at for name in silent)
-        verb, advice = "says", "Did it end? Its log tells; a first run compiles long."
+        verb, advice = "says", "Did it end? Its log tells."
         if len(silent) > 1:
-            verb, advice = "say", "Did they end? Their logs tell; a first run compiles long."
+            verb, advice = "say", "Did they end? Their logs tell."
         return _verdict("fault", f"{_join_names(silent)} {verb} nothing, for {age:.0f} s.", advice)
+
+    def _compiling_nodes_verdict(self) -> dict[str, str] | None:
+        """The verdict on the nodes that compile their kernels, with the longest time left."""
+        left = {name: _seconds_left(node) for name, node in self.nodes.items() if _is_compiling(node)}
+        if not left:
+            return None
+        text = self.nodes[max(left, key=lambda name: left[name])].values[_KERNELS]
+        advice = "That is so once on a computer. At the installation hmt_slam compile does it."
+        return _verdict("waiting", f"{_join_names(sorted(left))}: {text}.", advice)
 
     def _inactive_nodes_verdict(self) -> dict[str, str] | None:
         for name in self.nodes:
@@ -209,6 +225,16 @@ def _level(node: NodeHealth, now: float) -> Level:
 def _state(node: NodeHealth) -> str:
     """Lifecycle state; nodes without one are active."""
     return node.values.get("state", _ACTIVE)
+
+
+def _is_compiling(node: NodeHealth) -> bool:
+    return node.values.get(_KERNELS, "").startswith(COMPILING)
+
+
+def _seconds_left(node: NodeHealth) -> int:
+    """Time that the compilation of the kernels takes yet, s; 0 where it is unknown."""
+    found = re.search(r"[0-9]{1,6}", node.values[_KERNELS])
+    return int(found[0]) if found else 0
 
 
 def _join_names(names: Sequence[str]) -> str:
