@@ -111,8 +111,8 @@ def test_of_a_live_laser_fewer_scans_are_accepted_the_more_wait_for_topology(lis
         nodes.until(lambda: robot.send() and len(nodes.poses) > posed + 5)
         nodes.until(lambda: any(m.status[0].message.startswith("scans wait for topology") for m in nodes.diagnostics))
         # What DDS still holds is accepted or dropped before topology goes on, which would make room for it.
-        said = len(scan_counts(nodes))
-        nodes.until(lambda: len(counts := scan_counts(nodes)) > said + 1 and counts[-1] == counts[-2])
+        before = len(scan_counts(nodes))
+        nodes.until(lambda: len(counts := scan_counts(nodes)) > before + 1 and counts[-1] == counts[-2])
     finally:
         os.kill(tsbi.pid, signal.SIGCONT)
     nodes.until(lambda: nodes.diagnosis("slam")["waiting scans"] == "0")
