@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from hmt_slam_ros.area_abstraction.doors import OpeningDetector
     from hmt_slam_ros.area_abstraction.partition import AamState
     from hmt_slam_ros.messages.replica import Replica
-    from hmt_slam_ros.metric_slam.slam import MetricSlam, SlamState
+    from hmt_slam_ros.metric_slam.slam import SlamState
+    from hmt_slam_ros.metric_slam.speculation import SpeculativeSlam
     from hmt_slam_ros.sensors import Scan
     from hmt_slam_ros.submap.local_filter import FilterFactory
     from hmt_slam_ros.submap.local_mapping import LocalMapping
@@ -26,14 +27,14 @@ if TYPE_CHECKING:
     from hmt_slam_ros.topological_inference.tsbi import Tsbi, TsbiState
 
 
-def metric_slam(configuration: Configuration, state: SlamState | None = None) -> MetricSlam:
+def metric_slam(configuration: Configuration, state: SlamState | None = None) -> SpeculativeSlam:
     """Metric SLAM, with line filters where ``local_map.kind`` asks for them.
 
     :param state: state from which it continues, None for the start.
     """
-    from hmt_slam_ros.metric_slam.slam import MetricSlam  # noqa: PLC0415
+    from hmt_slam_ros.metric_slam.speculation import SpeculativeSlam  # noqa: PLC0415
 
-    return MetricSlam(configuration, state, filters_for(configuration))
+    return SpeculativeSlam(configuration, state, filters_for(configuration))
 
 
 def filters_for(configuration: Configuration) -> Callable[[LocalMapping], FilterFactory]:

@@ -157,6 +157,7 @@ class DelayedRun:
         self.configuration, self.random = configuration, np.random.default_rng(seed)
         self.processes = {row.name: row.make(configuration, None) for row in PROCESSES}
         self.pending, self.sent, self.early = deque(), [], 0
+        self.slams = [self.processes["slam"]]
 
     def run(self, measurements, lock_step=False):
         """Feed measurements, each as soon as chance has it; without a chance, once nothing is pending."""
@@ -185,6 +186,11 @@ class DelayedRun:
             # The others have a state between two events only.
             row = PROCESSES[self.random.integers(1 if self.pending else len(PROCESSES))]
             self.processes[row.name] = row.make(self.configuration, deepcopy(self.processes[row.name].state))
+            self.slams += [self.processes["slam"]] if row.name == "slam" else []
+
+    def total(self, name):
+        """A count of all metric SLAM processes together."""
+        return sum(getattr(slam.record, name) for slam in self.slams)
 
     def chain(self):
         """The messages of keyframe events, and the estimates, as bytes."""
@@ -207,6 +213,9 @@ def in_lock_step(measurements):
 def test_however_late_answers_come_and_whatever_is_made_again_decisions_are_the_same(measurements, in_lock_step, seed):
     delayed = DelayedRun(Configuration(), seed).run(measurements)
     assert delayed.early > 50
+    assert delayed.total("confirmed") > 10
+    assert delayed.total("refuted") > 1
+    assert 0 < delayed.total("repeated") < delayed.total("scans")
     found = delayed.chain()
     assert len(in_lock_step["Keyframe"]) > 50
     for kind, messages in in_lock_step.items():

@@ -79,13 +79,11 @@ class PatchState:
     :ivar odds: shape (n, 32, 32), evidence of occupancy of every cell in units of 0.05 nats, positive for occupied.
     :ivar field: shape (n, 32, 32), distance to the nearest occupied cell, 255 for the field's radius and more.
     :ivar occupied: shape (n, 32), bits of the cells of each row whose odds are positive, the lowest for column 0.
-    :ivar peak_patches: largest number of patches that were in use.
     """
 
     odds: Int8
     field: UInt8
     occupied: UInt32
-    peak_patches: int
 
 
 class PatchPool:
@@ -128,7 +126,7 @@ class PatchPool:
         # The last is for NO_PATCH.
         numbers = np.full(self.references.size + 1, NO_PATCH, dtype=np.int32)
         numbers[used] = np.arange(used.size, dtype=np.int32)
-        state = PatchState(self.odds[used], self.field[used], self.occupied[used], self._peak_patches)
+        state = PatchState(self.odds[used], self.field[used], self.occupied[used])
         return state, numbers[tables]
 
     def load(self, state: PatchState, tables: Int32) -> None:
@@ -141,7 +139,7 @@ class PatchPool:
         self.odds[:count], self.field[:count], self.occupied[:count] = state.odds, state.field, state.occupied
         self.references[:count] = np.bincount(tables[tables != NO_PATCH], minlength=count)
         self._free_count[0] -= count
-        self._peak_patches = state.peak_patches
+        self._peak_patches = count
 
     @property
     def patches_in_use(self) -> int:

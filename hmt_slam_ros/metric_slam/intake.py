@@ -84,6 +84,13 @@ class ScanQueue:
         """
         return ScanQueue(self._max_waiting, odometry, ScanQueueState(reported_faults=self._state.reported_faults))
 
+    def copy(self, odometry: OdometryBuffer) -> ScanQueue:
+        """A copy in the same state.
+
+        :param odometry: the readings for which its scans wait.
+        """
+        return ScanQueue(self._max_waiting, odometry, self.state)
+
     def add_odometry(self, odometry: Odometry) -> None:
         """Add a reading."""
         self._odometry.add(odometry)

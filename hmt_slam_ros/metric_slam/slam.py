@@ -35,6 +35,7 @@ from hmt_slam_ros.messages.messages import (
     EndOfLog,
     EndOfRun,
     Hypotheses,
+    Hypothesis,
     Keyframe,
     LocalEstimate,
     Message,
@@ -139,7 +140,8 @@ class MetricSlam:
             live_hypotheses={},
         )
         self._ended = False
-        # Not part of the state, since no decision depends on it.
+        # Not part of the state, since no decision depends on them.
+        self._is_fork = False
         self._look_ahead: LookAhead | None = None
         self._next_early = 0
 
@@ -230,13 +232,8 @@ class MetricSlam:
 
     def handle(self, message: Message) -> list[Message]:
         """Process a message, and the scans that are ready then; returns the answers."""
-        if isinstance(message, Odometry):
-            self._scan_queue.add_odometry(message)
-            if self._look_ahead is not None:
-                self._look_ahead.add_odometry(message)
-            return self._process_queue()
-        if isinstance(message, Scan):
-            return self._scan_queue.add_scan(message) + self._process_queue()
+        if isinstance(message, Odometry | Scan):
+            return self.enqueue(message) + self.process_queue()
         self._look_ahead = None  # whose map changes
         if isinstance(message, Hypotheses):
             self._apply_hypotheses(message)
@@ -247,7 +244,16 @@ class MetricSlam:
             return [] if self._state.lost and message.initial_pose is not None else self._reset_tracking()
         elif isinstance(message, EndOfLog):
             self._ended = True
-        return self._process_queue()
+        return self.process_queue()
+
+    def enqueue(self, measurement: Odometry | Scan) -> list[Message]:
+        """Add a measurement; returns notices of its faults."""
+        if isinstance(measurement, Scan):
+            return self._scan_queue.add_scan(measurement)
+        self._scan_queue.add_odometry(measurement)
+        if self._look_ahead is not None:
+            self._look_ahead.add_odometry(measurement)
+        return []
 
     def look_ahead(self) -> list[EarlyEstimate]:
         """Estimates of the scans that wait, as far as they have none yet.
@@ -272,7 +278,66 @@ class MetricSlam:
         self._look_ahead, self._next_early = ahead, ahead.next_scan
         return estimates
 
-    def _process_queue(self) -> list[Message]:
+    def fork(self) -> MetricSlam:
+        """A copy that goes on before the answer to the last event. It reads the same replica, but adds nothing to it.
+
+        At the end this has to :meth:`adopt` its state, or to :meth:`release` it.
+        """
+        other = MetricSlam.__new__(MetricSlam)
+        vars(other).update(vars(self), _is_fork=True, _look_ahead=None)
+        other._motion = MotionModel(self._configuration.motion, self._motion.state)
+        other._odometry_monitor = OdometryMonitor(self._odometry_monitor.state)
+        other._scan_queue = self._scan_queue.copy(other._motion.odometry)
+        other._live_hypotheses = {name: live.branch(name) for name, live in self._live_hypotheses.items()}
+        return other
+
+    def assume_unchanged(self) -> list[Message]:
+        """Go on as if the answer that is due changed nothing; returns the messages of the scans that waited."""
+        self._state = replace(self._state, awaiting_decision=False)
+        return self.process_queue()
+
+    def is_unchanged_by(self, answer: Hypotheses | ClosureDecision) -> bool:
+        """Whether an answer leaves all filters, and what decides about them, as they are; areas and arcs may change."""
+        if isinstance(answer, ClosureDecision):
+            return not answer.moved_keyframes and answer.hypothesis in (None, *self._only_hypothesis())
+        hypotheses = answer.hypotheses
+        return (
+            {hypothesis.id for hypothesis in hypotheses} == self._live_hypotheses.keys()
+            and not any(_changes_filter(hypothesis) for hypothesis in hypotheses)
+            and not (answer.pruned_keyframes or answer.stale_beams)
+            and all(hypothesis.lost for hypothesis in hypotheses) == self._state.lost
+            and min(hypotheses, key=lambda h: (-h.probability, h.id)).id == self._replica.best_hypothesis
+        )
+
+    def _only_hypothesis(self) -> list[int]:
+        """The live hypothesis, where there is one."""
+        return list(self._live_hypotheses) if len(self._live_hypotheses) == 1 else []
+
+    def adopt(self, other: MetricSlam, decision: ClosureDecision) -> None:
+        """Go on as a copy, after answers that change no filter.
+
+        :param decision: the last answer.
+        """
+        self._replica.apply_decision(decision)
+        self.release()
+        self._motion, self._odometry_monitor, self._scan_queue = (
+            other._motion,
+            other._odometry_monitor,
+            other._scan_queue,
+        )
+        self._live_hypotheses, self._state = other._live_hypotheses, other._state
+
+    def add_to_replica(self, keyframe: Keyframe) -> None:
+        """Add a keyframe that a copy made."""
+        self._replica.add_keyframe(keyframe)
+
+    def release(self) -> None:
+        """Free the maps of all filters."""
+        for live in self._live_hypotheses.values():
+            live.filter.release()
+
+    def process_queue(self) -> list[Message]:
+        """Process the scans that are ready, up to the next keyframe event; returns their messages."""
         answers: list[Message] = []
         while not self._state.awaiting_decision and self._scan_queue.is_ready(ended=self._ended):
             scan = self._scan_queue.next_scan
@@ -380,7 +445,8 @@ class MetricSlam:
             combine_stale_beams(changes),
             self._state.motion_condition,
         )
-        self._replica.add_keyframe(keyframe)
+        if not self._is_fork:
+            self._replica.add_keyframe(keyframe)
         # An initial pose is kept for one more event: the next scan is searched for there, even if the robot stands.
         self._state = replace(
             self._state,
@@ -497,3 +563,13 @@ class MetricSlam:
         processed, dropped = self._state.processed_scans, self._state.dropped_scans
         finished = EndOfRun(processed + dropped, processed, dropped)
         return [*self._take_scan_poses(), *self._notices(self._odometry_monitor.end_disagreement()), finished]
+
+
+def _changes_filter(hypothesis: Hypothesis) -> bool:
+    """Whether a hypothesis begins, or gets another local map, or loses the robot."""
+    return (
+        hypothesis.id != hypothesis.parent
+        or bool(hypothesis.local_areas)
+        or hypothesis.area_merge is not None
+        or hypothesis.tracking_reset
+    )

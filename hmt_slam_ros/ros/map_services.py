@@ -38,7 +38,7 @@ from hmt_slam_ros.saved_map.validation import check_process_states
 from hmt_slam_ros.untrusted_input import shorten
 
 if TYPE_CHECKING:
-    from hmt_slam_ros.metric_slam.slam import MetricSlam
+    from hmt_slam_ros.metric_slam.speculation import SpeculativeSlam
     from hmt_slam_ros.results.hmt_map import MapWriter
 
 _REQUEST_TIMEOUT = 60.0
@@ -60,7 +60,7 @@ class MapServicesNode(ProcessNode):
     :ivar estimate: the last estimate of metric SLAM, None before the first.
     """
 
-    process: MetricSlam
+    process: SpeculativeSlam
     save_to: Path
     map_frame: str
     estimate: LocalEstimate | None

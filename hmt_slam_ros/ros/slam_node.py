@@ -46,7 +46,7 @@ from hmt_slam_ros.saved_map.folder import VERSION, FolderReader
 from hmt_slam_ros.sensors import Odometry, Scan
 
 if TYPE_CHECKING:
-    from hmt_slam_ros.metric_slam.slam import MetricSlam
+    from hmt_slam_ros.metric_slam.speculation import SpeculativeSlam
     from hmt_slam_ros.results.hmt_map import MapWriter
 
 
@@ -95,7 +95,7 @@ class SlamNode(MapServicesNode):
         if self._initial_pose is not None and not self.start_from:
             raise HmtSlamError("initial_pose is set, but no map that it is a pose in: set start_from, or leave it away")
 
-    def make_process(self, initial_state: InitialState) -> MetricSlam:
+    def make_process(self, initial_state: InitialState) -> SpeculativeSlam:
         """As any process node; scans are numbered on from those before."""
         row = process_row("slam")
         state = initial_state.read_part(row.name, row.state_class) or row.state_class()
@@ -105,7 +105,7 @@ class SlamNode(MapServicesNode):
             processed_scans=state.processed_scans + offset,
             first_unpublished_scan=state.first_unpublished_scan + offset,
         )
-        process: MetricSlam = row.make(self.configuration, state)
+        process: SpeculativeSlam = row.make(self.configuration, state)
         return process
 
     def configure_node(self) -> None:
@@ -370,6 +370,7 @@ class SlamNode(MapServicesNode):
     def _check_inputs(self) -> None:
         """Report missing inputs once a second, and stop to wait for lost scans."""
         self.diagnostics.values["early estimates"] = str(self._early_estimates)
+        self.diagnostics.values["speculation"] = str(self.process.record)
         self.diagnostics.values["waiting scans"] = self.process.queued_scans + self._scan_intake.waiting_count
         self.deliver_ready_scans()
         self._scan_intake.warn_if_waiting()

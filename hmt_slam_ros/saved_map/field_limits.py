@@ -160,7 +160,7 @@ _LIMITS: Mapping[str, tuple[float, float]] = {
         ("keyframe_counts", "records_read", "first_scans", "events", "keyframe_events", "version"), _NUMBER
     ),
     **dict.fromkeys(("processed_scans", "dropped_scans", "first_unpublished_scan", "next_hypothesis"), _NUMBER),
-    **dict.fromkeys(("peak_patches", "leader", "detections", "misses", "sightings", "next_number", "sizes"), _NUMBER),
+    **dict.fromkeys(("leader", "detections", "misses", "sightings", "next_number", "sizes"), _NUMBER),
     **dict.fromkeys(("scan_index", "dropped", "separation_count", "dominant_keyframes", "change_count"), _NUMBER),
     **dict.fromkeys(("members", "mode_count", "kidnappings"), _NUMBER),
     **dict.fromkeys(("unreported", "beams", "hypothesis", "graph", "map_sizes", "checksum"), _NUMBER),

@@ -101,6 +101,8 @@ class ScanWriter:
         """A writer without scans."""
         self._names: dict[int, int] = {}
         self._scans: dict[int, Scan] = {}
+        # A number of an object may be given to another where it is deleted.
+        self._kept: list[Scan] = []
 
     @property
     def table(self) -> ScanTable:
@@ -108,14 +110,26 @@ class ScanWriter:
         return ScanTable.from_scans(self._scans.keys(), self._scans.values())
 
     def store(self, value: Scan) -> object:
-        """The name of a scan, which depends on the identity of the object."""
+        """The name of a scan; copies of a scan have one name."""
         name = self._names.get(id(value), value.stamp)
         while id(value) not in self._names:
-            if name not in self._scans:
-                self._names[id(value)], self._scans[name] = name, value
+            stored = self._scans.setdefault(name, value)
+            if stored is value or _is_copy(stored, value):
+                self._names[id(value)] = name
+                self._kept.append(value)
             else:
                 name += 1
         return name
+
+
+def _is_copy(scan: Scan, other: Scan) -> bool:
+    """Whether two scans of one stamp are the same in all fields."""
+    starts = scan.starts if scan.starts is not None else np.zeros(0, np.float32)
+    others = other.starts if other.starts is not None else np.zeros(0, np.float32)
+    arrays = (scan.ranges, other.ranges), (scan.laser_pose, other.laser_pose), (scan.motion, other.motion)
+    return all(getattr(scan, name) == getattr(other, name) for name in ("stamp", *_GEOMETRY)) and all(
+        own.tobytes() == theirs.tobytes() for own, theirs in (*arrays, (starts, others))
+    )
 
 
 class ScanReader:
