@@ -15,7 +15,7 @@ from benchmark.report import Report, Requirement, table
 from benchmark.settings import Settings, chosen_seeds, make_records
 from benchmark.simulated.loops import ALIKE_BEAMS, ALIKE_RADIUS, ALIKE_VIEW
 from benchmark.simulated.records import Record
-from hmt_slam_ros.offline.runtime import run_log
+from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.recorder import Recorder
 

@@ -28,7 +28,7 @@ from hmt_slam_ros.messages.map_changes import AreaPose
 from hmt_slam_ros.messages.messages import PoseReset
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.metric_slam.slam import MetricSlam
-from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.results.recorder import complete_area_poses

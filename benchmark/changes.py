@@ -23,7 +23,7 @@ from hmt_slam_ros.logs.records import Log
 from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.messages.messages import PoseReset
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.results.final_map import deskewed_scans, final_map
 from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses

@@ -27,7 +27,8 @@ from hmt_slam_ros.evaluation import StampedPoses, write_tum
 from hmt_slam_ros.logs import Log, LogRecord
 from hmt_slam_ros.messages.messages import AreaEvents, Keyframe, Message
 from hmt_slam_ros.messages.routing import Process
-from hmt_slam_ros.offline.runtime import RunResult, run_log
+from hmt_slam_ros.offline.lock_step import RunResult
+from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.final_map import FinalMap, deskewed_scans, final_map
 

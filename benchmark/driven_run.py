@@ -14,7 +14,7 @@ from hmt_slam_ros.exploration.pilot import PilotProcess
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.messages import Message
 from hmt_slam_ros.messages.tasks import Task, TaskResult, VelocityCommand
-from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.results.output_folder import map_writer
 from hmt_slam_ros.results.recorder import Recording

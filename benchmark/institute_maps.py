@@ -12,7 +12,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import stack_poses
-from hmt_slam_ros.offline.runtime import run_log
+from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.places.area_views import AreaView, AreaViewCache
 from hmt_slam_ros.places.chart import CROSSING, END, Chart, build_chart
 from hmt_slam_ros.sensors import Scan

@@ -20,7 +20,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.messages.messages import LocalEstimate
-from hmt_slam_ros.offline.runtime import run_log
+from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.real_time_localization.rtl import Rtl
 from hmt_slam_ros.registration import dynamic_rejection, scan_to_map

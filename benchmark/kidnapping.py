@@ -25,7 +25,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.records import SIMULATION_PREFIX, LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.metric_slam.slam import MetricSlam
-from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Scan
 

@@ -28,7 +28,7 @@ from hmt_slam_ros.logs.records import SIMULATION_PREFIX, Log, LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.messages import PoseReset
 from hmt_slam_ros.metric_slam.slam import MetricSlam
-from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.output_folder import scan_bytes
 from hmt_slam_ros.sensors import Scan

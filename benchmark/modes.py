@@ -24,7 +24,7 @@ from hmt_slam_ros.evaluation import StampedPoses, evaluate_relations, read_tum
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.metric_slam.slam import MetricSlam
-from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.submap.local_filter import ParticleFilterState
 from hmt_slam_ros.submap.pose_modes import normalize_weights

@@ -30,7 +30,7 @@ from hmt_slam_ros.messages.messages import Message
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.messages.routing import Process
 from hmt_slam_ros.metric_slam.slam import MetricSlam
-from hmt_slam_ros.offline.runtime import LockStep
+from hmt_slam_ros.offline.lock_step import LockStep
 from hmt_slam_ros.real_time_localization.rtl import Rtl
 from hmt_slam_ros.sensors import Odometry
 from hmt_slam_ros.topological_inference.branching import MIN_EXAMINED_AREAS, Branching

@@ -21,7 +21,7 @@ from hmt_slam_ros.loop_closure.closure_history import PathStep
 from hmt_slam_ros.messages.messages import LocalEstimate, ScanPoses
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.metric_slam.live_hypothesis import KeyframeCovariances
-from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.own_files import replace_folder
 from hmt_slam_ros.results.hmt_map import MapWriter, RunState, read_run_state, read_saved_map

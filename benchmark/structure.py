@@ -21,7 +21,7 @@ from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
 from hmt_slam_ros.configuration import load_configuration
-from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 
 PACKAGE = Path(sys.modules["hmt_slam_ros"].__file__ or "").parent

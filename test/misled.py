@@ -8,7 +8,7 @@ from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.messages.documents import decode, encode
 from hmt_slam_ros.messages.map_changes import Arc
 from hmt_slam_ros.messages.messages import ClosureDecision, EndOfLog, Hypotheses
-from hmt_slam_ros.offline.runtime import LockStep
+from hmt_slam_ros.offline.lock_step import LockStep
 from hmt_slam_ros.process_table import PROCESSES
 from hmt_slam_ros.results.recorder import Recorder
 from hmt_slam_ros.sensors import Scan

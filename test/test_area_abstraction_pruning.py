@@ -6,7 +6,7 @@ import pytest
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.messages import Hypotheses
-from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.recorder import Recorder
 from hmt_slam_ros.sensors import Scan

@@ -15,7 +15,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.messages import Keyframe
-from hmt_slam_ros.offline.runtime import run_log
+from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import open_simulated
 

@@ -19,7 +19,7 @@ from benchmark.table import (
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import AreaEvents, Hypotheses
-from hmt_slam_ros.offline.runtime import run_log
+from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.open_log import open_log
 
 LOG = MeasuredLog("aces", Path("aces.clf"))

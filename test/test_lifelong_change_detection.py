@@ -11,7 +11,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.lifelong.change_detection import RecentScan, append_recent_scan, combine_stale_beams, detect_changes
 from hmt_slam_ros.messages.documents import KeyframeHeader, encode
 from hmt_slam_ros.messages.map_changes import StaleBeams
-from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.results.hmt_map import MapWriter, read_run_state
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.polar_scan import FREE, SURFACE, UNKNOWN, classify_points, occlusion_starts, to_polar_scan

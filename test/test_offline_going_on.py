@@ -13,7 +13,8 @@ from hmt_slam_ros.cli import run_commands
 from hmt_slam_ros.cli.arguments import build_parser
 from hmt_slam_ros.configuration import Configuration, load_configuration, with_changes
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.offline.runtime import LockStepRun, run_log
+from hmt_slam_ros.offline.lock_step import LockStepRun
+from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.hmt_map import PARTS, RunState, read_run_state
 from hmt_slam_ros.results.log_reading import describe_parameter_changes, map_folder

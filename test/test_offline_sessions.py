@@ -11,7 +11,8 @@ from preloaded import hmt_slam
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.evaluation import read_tum
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.offline.runtime import LockStepRun, run_log
+from hmt_slam_ros.offline.lock_step import LockStepRun
+from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.final_map import deskewed_scans, final_map
 from hmt_slam_ros.results.log_reading import LogProgress, LogReader, is_newest_log

@@ -32,7 +32,8 @@ def run_with_row(function, *arguments):
 
 def map_and_go_on(folder):
     from hmt_slam_ros.configuration import Configuration  # noqa: PLC0415  when the row is in the table
-    from hmt_slam_ros.offline.runtime import LockStepRun, run_log  # noqa: PLC0415
+    from hmt_slam_ros.offline.lock_step import LockStepRun  # noqa: PLC0415
+    from hmt_slam_ros.offline.run import run_log  # noqa: PLC0415
     from hmt_slam_ros.open_log import open_log  # noqa: PLC0415
     from hmt_slam_ros.results.hmt_map import MapWriter, read_run_state  # noqa: PLC0415
 

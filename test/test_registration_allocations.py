@@ -9,7 +9,7 @@ from test_registration_scan_to_map import ALIGNMENT, MODEL, ROOM, make_map, scan
 
 from benchmark.allocations import ARRAYS, count_allocations, requirements_on
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.offline.runtime import run_log
+from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.registration import scan_to_map
 

@@ -20,7 +20,7 @@ from preloaded import hmt_slam
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import read_tum
-from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.hmt_map import read_saved_map
 

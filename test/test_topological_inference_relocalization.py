@@ -15,7 +15,7 @@ from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative, uninformativ
 from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.messages.messages import PoseReset
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter
 from hmt_slam_ros.sensors import Odometry, Scan

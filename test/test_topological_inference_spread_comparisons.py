@@ -10,7 +10,7 @@ import pytest
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.messages import AreaEvent
-from hmt_slam_ros.offline.runtime import LockStepRun
+from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter
 from hmt_slam_ros.topological_inference import event_work

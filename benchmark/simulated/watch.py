@@ -33,7 +33,7 @@ from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.messages import ClosureDecision, EndOfLog, Hypotheses, Keyframe, Message, RealTimePose
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
 from hmt_slam_ros.messages.routing import Process
-from hmt_slam_ros.offline.runtime import LockStep
+from hmt_slam_ros.offline.lock_step import LockStep
 from hmt_slam_ros.process_table import PROCESSES
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation import SimulatedLog, open_simulated

@@ -31,7 +31,7 @@ from hmt_slam_ros.messages.messages import ClosureDecision, EndOfLog, Hypotheses
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.routing import Process
 from hmt_slam_ros.metric_slam.slam import MetricSlam
-from hmt_slam_ros.offline.runtime import LockStep
+from hmt_slam_ros.offline.lock_step import LockStep
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.process_table import PROCESSES
 from hmt_slam_ros.registration.consistency import MapAgreement

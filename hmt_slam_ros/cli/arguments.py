@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import NoReturn
 
@@ -87,6 +88,19 @@ def _add_map_arguments(command: argparse.ArgumentParser) -> None:
         choices=("mapping", "localization", "lifelong"),
         help="localization leaves the map of --from as it is, lifelong changes it only where the world has",
     )
+    command.add_argument(
+        "--jobs",
+        type=_count,
+        default=len(os.sched_getaffinity(0)),
+        metavar="N",
+        help="OS processes, of which two have work; by default one for each core. The results are the same",
+    )
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not int(text):
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 1 on")
+    return int(text)
 
 
 def _add_replay_arguments(command: argparse.ArgumentParser) -> None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import gc
-import resource
 import shutil
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -21,9 +20,9 @@ from hmt_slam_ros.cli.terminal import Progress, report_left_out, summary
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
-from hmt_slam_ros.offline.runtime import run_log
+from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.open_log import open_log
-from hmt_slam_ros.process_memory import proportional_set_size
+from hmt_slam_ros.process_memory import resource_usage
 from hmt_slam_ros.results.final_map import FinalMap, deskewed_scans, final_map
 from hmt_slam_ros.results.hmt_map import RunState, read_run_state, read_saved_map
 from hmt_slam_ros.results.log_reading import describe_log, describe_parameter_changes, is_newest_log, map_folder
@@ -45,7 +44,7 @@ def run_map(options: argparse.Namespace) -> None:
     log_seconds = log.duration
     with atomic_output(options.out) as folder:
         writer = map_writer(folder)
-        final, source_stamps, figures = run_measured(log, configuration, state, writer.write_state)
+        final, source_stamps, figures = run_measured(log, configuration, state, writer.write_state, options.jobs)
         del log, state  # they may be large
         write_output(folder, final, source_stamps, figures, configuration, writer)
         if configuration.mode == "localization":
@@ -90,34 +89,39 @@ def run_measured(
     configuration: Configuration,
     state: RunState | None = None,
     on_state: Callable[[RunState], None] | None = None,
+    jobs: int = 1,
 ) -> tuple[FinalMap, NDArray[np.int64], RunMetrics]:
     """Map a log and measure the cost.
 
     :param state: state from which the run continues.
     :param on_state: called with the state at the end of the log, before the processes receive ``EndOfLog``.
+    :param jobs: OS processes.
     :returns: the map, the log's own stamps of all scans, shape (n,), ns, and the figures.
     """
     wall, cpu = time.monotonic(), time.process_time()
     # Libraries and the log stay in memory to the end, so the garbage collector need not scan them.
     gc.freeze()
     with Progress(log.scan_count, log.duration) as progress:
-        result = run_log(log, configuration, progress, state=state, on_state=on_state, compact_record=True)
+        result = run_log(log, configuration, progress, state=state, on_state=on_state, compact_record=True, jobs=jobs)
     begin = time.process_time()
     recording = result.recorder.finish(
         result.log_progress.stamps, result.log_progress.first_scans, result.log_progress.earlier_trajectory
     )
     final = final_map(recording, partial(deskewed_scans, log, configuration), configuration)
+    usage, topology = {"hmt_slam": resource_usage()}, result.topology_usage
+    if topology is not None:
+        usage["topology"] = topology
     figures = RunMetrics(
         log=log.name,
         runtime="lock-step",
         seconds_per_scan=result.seconds_per_scan,
-        # ru_maxrss counts in units of 1024 bytes on Linux.
-        peak_rss={"hmt_slam": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss},
-        pss={"hmt_slam": proportional_set_size()},
+        peak_rss={name: own.peak_rss for name, own in usage.items()},
+        pss={name: own.pss for name, own in usage.items()},
         wall_seconds=time.monotonic() - wall,
-        cpu_seconds=time.process_time() - cpu,
+        cpu_seconds=time.process_time() - cpu + (topology.cpu_seconds if topology else 0.0),
         refinement_seconds=time.process_time() - begin,
         memory={"particle_maps": result.map_bytes} | code_bytes(),
+        speculation=asdict(result.speculation) if result.speculation else {},
     )
     return final, result.log_progress.source_stamps, figures
 

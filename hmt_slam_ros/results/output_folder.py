@@ -79,6 +79,7 @@ class RunMetrics:
     :ivar cpu_seconds: CPU time of all OS processes together, s.
     :ivar refinement_seconds: CPU time of the final refinement, s.
     :ivar memory: {part of the program: bytes}, where it is known.
+    :ivar speculation: how often metric SLAM worked ahead, {name: count}; empty where it did not.
     """
 
     log: str
@@ -90,6 +91,7 @@ class RunMetrics:
     cpu_seconds: float
     refinement_seconds: float
     memory: Mapping[str, int] = field(default_factory=dict)
+    speculation: Mapping[str, int] = field(default_factory=dict)
 
 
 @contextmanager
@@ -267,6 +269,7 @@ def build_report(recording: Recording, configuration: Configuration, figures: Ru
         "peak_rss_bytes": dict(figures.peak_rss),
         "pss_bytes": dict(figures.pss),
         "memory_bytes": dict(figures.memory) | {"keyframe_scans": scan_bytes(replica.scans.values())},
+        "speculation": dict(figures.speculation),
         "wall_s": figures.wall_seconds,
         "cpu_s": figures.cpu_seconds,
         "refinement_s": figures.refinement_seconds,

@@ -12,13 +12,12 @@ import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import IO
 
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.process_memory import peak_rss, proportional_set_size
+from hmt_slam_ros.process_memory import ResourceUsage, resource_usage
 from hmt_slam_ros.process_table import node_command
 from hmt_slam_ros.ros.child_processes import MAX_RESTARTS, PARENT_VARIABLE, RestartLimit
 
@@ -79,20 +78,6 @@ def _is_free(port: int) -> bool:
         except OSError:
             return False
     return True
-
-
-@dataclass(frozen=True)
-class ResourceUsage:
-    """Resources of an OS process so far.
-
-    :ivar peak_rss: largest resident memory, bytes.
-    :ivar pss: proportional set size, bytes.
-    :ivar cpu_seconds: user and system time.
-    """
-
-    peak_rss: int
-    pss: int
-    cpu_seconds: float
 
 
 class NodeProcesses:
@@ -160,10 +145,7 @@ class NodeProcesses:
 
     def usage(self) -> dict[str, ResourceUsage]:
         """{node: resources so far}."""
-        return {
-            name: ResourceUsage(peak_rss(process.pid), proportional_set_size(process.pid), _cpu_seconds(process.pid))
-            for name, process in self.processes.items()
-        }
+        return {name: resource_usage(process.pid) for name, process in self.processes.items()}
 
     def stop(self) -> None:
         """End all nodes by SIGINT, and those that do not react by SIGKILL."""
@@ -187,14 +169,3 @@ class NodeProcesses:
     ) -> None:
         """End all nodes."""
         self.stop()
-
-
-def _cpu_seconds(pid: int) -> float:
-    """User and system time of an OS process, s; 0 where it is unknown."""
-    try:
-        line = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return 0.0
-    # Fields 14 and 15 of the line; field 2 is in parentheses and may hold spaces.
-    ticks = line.rpartition(")")[2].split()[11:13]
-    return sum(map(int, ticks)) / float(os.sysconf("SC_CLK_TCK"))

@@ -31,6 +31,7 @@ from hmt_slam_ros.messages.messages import AreaEvents, Message
 from hmt_slam_ros.messages.routing import SUBSCRIPTIONS
 from hmt_slam_ros.messages.system_name import SystemName
 from hmt_slam_ros.open_log import is_simulated, open_log
+from hmt_slam_ros.process_memory import ResourceUsage
 from hmt_slam_ros.process_table import COORDINATOR, RECORDER, consumer_count, process_names, producer
 from hmt_slam_ros.results.final_map import deskewed_scans, final_map
 from hmt_slam_ros.results.output_folder import RunMetrics, atomic_output, write_output
@@ -41,7 +42,7 @@ from hmt_slam_ros.ros.diagnostics import SYSTEM, NodeDiagnostics
 from hmt_slam_ros.ros.execution import wait_until_alone
 from hmt_slam_ros.ros.guarded_node import GuardedNode
 from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
-from hmt_slam_ros.ros.node_processes import NodeProcesses, ResourceUsage, own_domain
+from hmt_slam_ros.ros.node_processes import NodeProcesses, own_domain
 from hmt_slam_ros.ros.topics import COST, DIAGNOSTICS, TFMessage
 from hmt_slam_ros.sensors import Scan
 

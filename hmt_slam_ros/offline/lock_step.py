@@ -7,6 +7,7 @@ from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from hmt_slam_ros.logs.records import Log, LogRecord
 from hmt_slam_ros.messages.messages import EndOfLog, Message, PoseReset
 from hmt_slam_ros.messages.routing import SUBSCRIPTIONS, Checkpointable, Process
 from hmt_slam_ros.metric_slam.slam import MetricSlam
+from hmt_slam_ros.metric_slam.speculation import SpeculationRecord
+from hmt_slam_ros.process_memory import ResourceUsage
 from hmt_slam_ros.process_table import COORDINATOR, PROCESSES, RECORDER
 from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.results.log_reading import LogProgress, LogReader, is_newest_log
@@ -35,15 +38,27 @@ class LockStep:
     seconds: dict[str, float] = field(default_factory=dict)
     _subscribers: dict[type, list[tuple[str, Process]]] = field(default_factory=dict)
 
-    def feed(self, message: Message) -> None:
-        """Deliver a message and all messages that it causes."""
-        pending: deque[Message] = deque([message])
+    def feed(self, *messages: Message) -> list[Message]:
+        """Deliver messages and all messages that they cause; returns these."""
+        pending, caused = deque(messages), list[Message]()
         while pending:
-            current = pending.popleft()
-            for name, process in self._subscribers_of(type(current)):
-                begin = time.perf_counter()
-                pending.extend(process.handle(current))
-                self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+            answers = self.deliver(pending.popleft())
+            pending.extend(answers)
+            caused += answers
+        return caused
+
+    def deliver(self, message: Message) -> list[Message]:
+        """Deliver a message; returns the messages that answer it."""
+        answers: list[Message] = []
+        for name, process in self._subscribers_of(type(message)):
+            begin = time.perf_counter()
+            answers += process.handle(message)
+            self.add_seconds(name, time.perf_counter() - begin)
+        return answers
+
+    def add_seconds(self, name: str, seconds: float) -> None:
+        """Add to the computing time of a process."""
+        self.seconds[name] = self.seconds.get(name, 0.0) + seconds
 
     def _subscribers_of(self, kind: type) -> list[tuple[str, Process]]:
         if kind not in self._subscribers:
@@ -66,12 +81,16 @@ class RunResult:
     :ivar log_progress: progress through the logs.
     :ivar seconds_per_scan: {process: shape (m,), computing time for each scan of this run, s}.
     :ivar map_bytes: peak memory of the maps of all particles, bytes.
+    :ivar topology_usage: resources of the second OS process, None in lock-step.
+    :ivar speculation: how often metric SLAM worked ahead, None in lock-step.
     """
 
     recorder: Recorder
     log_progress: LogProgress
     seconds_per_scan: dict[str, NDArray[np.float64]]
     map_bytes: int
+    topology_usage: ResourceUsage | None = None
+    speculation: SpeculationRecord | None = None
 
 
 class LockStepRun:
@@ -117,11 +136,13 @@ class LockStepRun:
     @property
     def state(self) -> RunState:
         """The state between two records of the log."""
-        return RunState(
-            self._log_reader.state,
-            {name: process.state for name, process in self._processes.items()},
-            self.recorder.record(),
-        )
+        states = self.process_states()
+        ordered = {row.name: states[row.name] for row in PROCESSES}
+        return RunState(self._log_reader.state, ordered, self.recorder.record())
+
+    def process_states(self) -> dict[str, Any]:
+        """{process: state}."""
+        return {name: process.state for name, process in self._processes.items()}
 
     def unread_records(self, log: Log) -> Iterator[LogRecord]:
         """The unread records of a log. A further log begins with a reset of the robot's pose.
@@ -150,34 +171,3 @@ class LockStepRun:
         assert isinstance(slam, MetricSlam)
         seconds = {name: np.array(values) for name, values in self._seconds_per_scan.items()}
         return RunResult(self.recorder, self._log_reader.state, seconds, slam.peak_map_bytes)
-
-
-def run_log(
-    log: Log,
-    configuration: Configuration,
-    progress: Callable[[int], None] | None = None,
-    abstraction: Callable[[Configuration], Process] | None = None,
-    state: RunState | None = None,
-    on_state: Callable[[RunState], None] | None = None,
-    compact_record: bool = False,
-) -> RunResult:
-    """Map a whole log.
-
-    :param log: the newest log of the state, or a further one.
-    :param progress: called with the number of scans read, after each scan.
-    :param abstraction: makes the process that replaces the AAM.
-    :param state: state from which the run continues, with the first record that was not read.
-    :param on_state: called with the state after the last record, before ``EndOfLog``.
-    :param compact_record: whether the recorder replaces messages by a record, which saves memory in long runs.
-    :raises HmtSlamError: where the log is faulty.
-    """
-    run = LockStepRun(configuration, abstraction, state)
-    for record in run.unread_records(log):
-        run.process_record(record)
-        if compact_record:
-            run.recorder.compact()
-        if progress and isinstance(record.measurement, Scan):
-            progress(run.scans_read)
-    if on_state:
-        on_state(run.state)
-    return run.finish()
