@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -193,7 +192,8 @@ class BagLog:
         truth, source = self._true_poses.get(measurement.source_stamp), measurement.source_stamp
         if measurement.scan_frame is not None:
             mounting = self._mountings[measurement.scan_frame]
-            return LogRecord(source, _scan_from_message(measurement.content, stamp, mounting), truth)
+            message = measurement.content
+            return LogRecord(source, _scan_from_message(message, stamp, mounting, message.time_increment), truth)
         position, rotation = measurement.content
         return LogRecord(source, Odometry(stamp, _pose_from_parts(position, rotation)), truth)
 
@@ -204,8 +204,8 @@ class BagLog:
         """
         stamp = measurement.source_stamp
         if measurement.scan_frame is not None:
-            scan = _scan_from_message(measurement.content, stamp, _AT_THE_BASE)
-            check_scan(replace(scan, time_increment=0.0))  # which may be wrong, as in `check_measurement`
+            # The time from beam to beam may be wrong, as in `check_measurement`.
+            check_scan(_scan_from_message(measurement.content, stamp, _AT_THE_BASE, time_increment=0.0))
             return
         position, rotation = measurement.content
         check_quaternion((rotation.x, rotation.y, rotation.z, rotation.w))
@@ -309,7 +309,7 @@ def _precedes_its_scan(headers: list[tuple[int, int, str | None]]) -> list[bool]
     return [*pairs, False][: len(headers)]
 
 
-def _scan_from_message(message: RosMessage, stamp: int, mounting: Mounting) -> Scan:
+def _scan_from_message(message: RosMessage, stamp: int, mounting: Mounting, time_increment: float) -> Scan:
     ranges: NDArray[np.float32] = message.ranges
     return Scan(
         stamp,
@@ -319,5 +319,5 @@ def _scan_from_message(message: RosMessage, stamp: int, mounting: Mounting) -> S
         message.range_min,
         message.range_max,
         mounting.laser_pose,
-        message.time_increment,
+        time_increment,
     )

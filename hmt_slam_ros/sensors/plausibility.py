@@ -47,17 +47,17 @@ def check_scan(scan: Scan) -> Scan:
     :raises HmtSlamError: names the field, its value and the remedy.
     """
     _check_stamp(scan.stamp)
-    _require(scan.ranges.size <= MAX_BEAMS, "ranges", scan.ranges.size, f"at most {MAX_BEAMS} beams")
+    beams = scan.ranges.size
+    _require(beams <= MAX_BEAMS, "ranges", beams, "at most {} beams", MAX_BEAMS)
     for name in ("angle_min", "angle_increment", "range_min", "time_increment"):
         _require(math.isfinite(getattr(scan, name)), name, getattr(scan, name), "a finite number")
-    increment = abs(scan.angle_increment)
-    if scan.ranges.size > 1:
-        most = MAX_SWEEP_ANGLE / (scan.ranges.size - 1)
-        wanted = f"{MIN_ANGLE_INCREMENT:g} to {most:g} rad between {scan.ranges.size} beams"
-        _require(MIN_ANGLE_INCREMENT <= increment <= most, "angle_increment", scan.angle_increment, wanted)
+    if beams > 1:
+        least, most = MIN_ANGLE_INCREMENT, MAX_SWEEP_ANGLE / (beams - 1)
+        fits, wanted = least <= abs(scan.angle_increment) <= most, "{:g} to {:g} rad between {} beams"
+        _require(fits, "angle_increment", scan.angle_increment, wanted, least, most, beams)
     _require(abs(scan.angle_min) <= MAX_SWEEP_ANGLE, "angle_min", scan.angle_min, "within 4 pi rad")
     _require(scan.range_min >= 0.0, "range_min", scan.range_min, "0 m or more")
-    _require(scan.range_max > scan.range_min, "range_max", scan.range_max, f"beyond range_min, {scan.range_min:g} m")
+    _require(scan.range_max > scan.range_min, "range_max", scan.range_max, "beyond range_min, {:g} m", scan.range_min)
     _require(scan.time_increment >= 0.0, "time_increment", scan.time_increment, "0 s or more")
     _require(
         scan.sweep_duration <= MAX_SWEEP_DURATION, "time_increment", scan.time_increment, "a sweep of at most 60 s"
@@ -82,8 +82,9 @@ def check_planar_pose(pose: NDArray[np.float64], name: str, reach: float) -> Non
     :param reach: largest magnitude of x and y, m.
     :raises HmtSlamError: where it is not.
     """
-    near = bool(np.isfinite(pose).all()) and max(abs(float(pose[0])), abs(float(pose[1]))) <= reach
-    _require(near, name, pose.tolist(), f"finite, with x and y within {reach:g} m")
+    numbers = pose.tolist()
+    near = all(map(math.isfinite, numbers)) and abs(numbers[0]) <= reach and abs(numbers[1]) <= reach
+    _require(near, name, numbers, "finite, with x and y within {:g} m", reach)
 
 
 def check_quaternion(quaternion: Sequence[float], name: str = "orientation") -> None:
@@ -99,6 +100,12 @@ def _check_stamp(stamp: int) -> None:
     _require(0 <= stamp <= MAX_STAMP, "stamp", stamp, "a time between the years 1970 and 2116")
 
 
-def _require(holds: bool, name: str, value: object, wanted: str) -> None:
+def _require(holds: bool, name: str, value: object, wanted: str, *limits: float) -> None:
+    """Refuse a value; the text is made only then.
+
+    :param wanted: what the value has to be, a format of the limits.
+    """
     if not holds:
-        raise HmtSlamError(f"{name} = {value} is not {wanted}: correct the driver, or leave the message out")
+        raise HmtSlamError(
+            f"{name} = {value} is not {wanted.format(*limits)}: correct the driver, or leave the message out"
+        )

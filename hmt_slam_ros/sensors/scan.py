@@ -8,6 +8,7 @@ informs the pose along that normal only. Points on no surface, such as posts and
 from __future__ import annotations
 
 import math
+from array import array
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
 from statistics import median
@@ -20,6 +21,9 @@ from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry import se2
 
 _MICROSECONDS = 1e6
+
+_FLOAT32_FIELDS = ("angle_min", "angle_increment", "range_min", "range_max", "time_increment")
+"""Fields of a scan that have the precision of sensor_msgs/LaserScan."""
 
 
 @lru_cache(maxsize=4)
@@ -101,9 +105,10 @@ class Scan:
     _revised: tuple[BeamRevision, Scan] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        for name in ("angle_min", "angle_increment", "range_min", "range_max", "time_increment"):
-            with np.errstate(over="ignore"):  # beyond float32 it is infinite, which the checks of a scan refuse
-                object.__setattr__(self, name, float(np.float32(getattr(self, name))))
+        numbers = (self.angle_min, self.angle_increment, self.range_min, self.range_max, self.time_increment)
+        # Beyond float32 a number is infinite, which the checks of a scan refuse.
+        for name, rounded in zip(_FLOAT32_FIELDS, array("f", numbers), strict=True):
+            object.__setattr__(self, name, rounded)
 
     @property
     def sweep_duration(self) -> float:
