@@ -82,7 +82,9 @@ def _open_file(path: Path, head: bytes, window: TimeWindow) -> Log:
     if is_rawlog(content):
         return open_rawlog(path, content, window)
     if is_carmen(content):
-        return open_carmen(path, content, window)
+        file = io.BytesIO(content)
+        del content  # the reader closes the file, which frees the content
+        return open_carmen(path, file, window)
     raise HmtSlamError(
         f"{path} is of no known format: give a rosbag2 folder, a .mcap or .db3 file, a CARMEN log, an MRPT rawlog, or "
         f"{SIMULATION_PREFIX}WORLD for a simulated drive."

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -44,9 +45,20 @@ def no_return_threshold(ranges: NDArray[np.float32]) -> float:
     :param ranges: shape (n,), all readings of the log, m.
     :returns: the smallest reading of that crowd; without one, just beyond the largest reading (inf without readings).
     """
-    values, counts = np.unique(ranges[np.isfinite(ranges) & (ranges > 0.0)], return_counts=True)
-    if not values.size:
+    return _threshold_of_sorted(np.sort(ranges))
+
+
+def _threshold_of_sorted(ranges: NDArray[np.float32]) -> float:
+    """`no_return_threshold` of increasing readings; copies of them would take as much memory as the log.
+
+    :param ranges: shape (n,), m, NaN at the end.
+    """
+    first, end = np.searchsorted(ranges, np.float32(0.0), "right"), np.searchsorted(ranges, np.float32(np.inf))
+    if first == end:
         return float("inf")
+    finite = ranges[first:end]
+    starts = np.concatenate(([0], np.flatnonzero(finite[1:] != finite[:-1]) + 1))
+    values, counts = finite[starts], np.diff(starts, append=finite.size)
     repeated = np.flatnonzero(counts >= _MIN_REPEATS)
     if repeated.size:
         maximum = float(values[repeated[-1]])
@@ -84,8 +96,7 @@ _SAME_OFFSET = 2e-3
 """Largest difference of equal offsets, m and rad: poses are written with six decimals."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Sweep:
+class _Sweep(NamedTuple):
     """A scan in a line.
 
     :ivar ranges: shape (n,), float32, m.
@@ -117,7 +128,7 @@ class _StampedLine(NamedTuple):
 class _ParsedFile:
     """The content of a file, without the lines of poses that cannot be right."""
 
-    readings: list[_StampedLine] = field(default_factory=list)
+    readings: deque[_StampedLine] = field(default_factory=deque)
     left_out: LeftOut = field(default_factory=LeftOut)
     front_laser_offset: float = 0.0
 
@@ -127,7 +138,7 @@ def is_carmen(content: bytes) -> bool:
     return _KNOWN_LINE.search(content[:65536]) is not None
 
 
-def open_carmen(path: Path, content: bytes, window: TimeWindow) -> InMemoryLog:
+def open_carmen(path: Path, file: io.BytesIO, window: TimeWindow) -> InMemoryLog:
     """A CARMEN log, in file order.
 
     Odometry is read from ODOM lines and, with each scan, from the ``odom_*`` fields of FLASER or the robot pose of
@@ -136,23 +147,30 @@ def open_carmen(path: Path, content: bytes, window: TimeWindow) -> InMemoryLog:
     maximum, which `no_return_threshold` finds from all scans together.
 
     :param path: path of the file, for the name of the log.
-    :param content: content of the file, decompressed.
+    :param file: content of the file, decompressed; closed once it is read, so that it takes no more memory.
     :param window: part of the log to read.
     :raises HmtSlamError: where a line is cut off or malformed, or there is no scan.
     """
-    parsed = _parse(content, path.name)
-    sweeps = [reading.content for reading in parsed.readings if isinstance(reading.content, _Sweep)]
-    limits = _range_limits(sweeps)
-    mounting = _Mountings(sweeps, parsed.front_laser_offset)
-    return InMemoryLog(_stem(path), _entries(parsed.readings, limits, mounting), window, parsed.left_out)
+    with file, np.errstate(over="ignore"):  # a range beyond float32 is infinite, so there is no return
+        parsed = _parse(file, path.name)
+    limits, mountings = _common_properties(parsed)
+    return InMemoryLog(_stem(path), _entries(parsed.readings, limits, mountings), window, parsed.left_out)
 
 
 def _stem(path: Path) -> str:
     return Path(path.stem).stem if path.suffix in {".gz", ".xz"} else path.stem
 
 
-def _entries(readings: Iterable[_StampedLine], limits: dict[float, float], mountings: _Mountings) -> Iterator[LogEntry]:
-    for stamp, content in readings:
+def _common_properties(parsed: _ParsedFile) -> tuple[dict[float, float], _Mountings]:
+    """The limits of the ranges and the mountings of the laser, which all scans together show."""
+    sweeps = [reading.content for reading in parsed.readings if isinstance(reading.content, _Sweep)]
+    return _range_limits(sweeps), _Mountings(sweeps, parsed.front_laser_offset)
+
+
+def _entries(readings: deque[_StampedLine], limits: dict[float, float], mountings: _Mountings) -> Iterator[LogEntry]:
+    """The measurements; the readings are removed one by one, so that the log is not twice in memory."""
+    while readings:
+        stamp, content = readings.popleft()
         if isinstance(content, _Sweep):
             yield LogEntry(stamp, Odometry, (content.robot_pose,), precedes_its_scan=True)
             limit = limits[content.stated_max]
@@ -162,10 +180,10 @@ def _entries(readings: Iterable[_StampedLine], limits: dict[float, float], mount
             yield LogEntry(stamp, Odometry, (content,))
 
 
-def _parse(content: bytes, name: str) -> _ParsedFile:
+def _parse(file: io.BytesIO, name: str) -> _ParsedFile:
     parsed = _ParsedFile()
     # Line by line: splitting all at once would fragment as much memory as the log takes.
-    for number, line in enumerate(io.BytesIO(content), start=1):
+    for number, line in enumerate(file, start=1):
         if len(line) > _MAX_LINE:
             raise HmtSlamError(
                 f"line {number} of {name} has {len(line)} bytes, more than {_MAX_LINE}: copy the log anew."
@@ -211,17 +229,17 @@ def _front_laser_offset(tokens: list[bytes]) -> float:
 
 def _parse_odom(tokens: list[bytes]) -> _StampedLine:
     """``ODOM x y theta tv rv accel`` and the trailer."""
-    return _StampedLine(_stamp(tokens, 7), np.array(_numbers(tokens, 1, 3)))
+    return _StampedLine(_stamp(tokens, 7), _pose(tokens, 1))
 
 
 def _parse_flaser(tokens: list[bytes]) -> _StampedLine:
     """``FLASER n r1..rn x y theta odom_x odom_y odom_theta`` and the trailer."""
     count = _count(tokens[1])
     stamp = _stamp(tokens, 2 + count + 6)
-    poses = np.array(_numbers(tokens, 2 + count, 6))
+    laser_pose, robot_pose = _pose(tokens, 2 + count), _pose(tokens, 5 + count)
     increment = np.pi / max(count - count % 2, 1)
     ranges = _ranges(tokens, 2, count)
-    return _StampedLine(stamp, _Sweep(ranges, -np.pi / 2, increment, np.inf, poses[3:], poses[:3], is_front=True))
+    return _StampedLine(stamp, _Sweep(ranges, -np.pi / 2, increment, np.inf, robot_pose, laser_pose, is_front=True))
 
 
 def _parse_robotlaser(tokens: list[bytes]) -> _StampedLine:
@@ -230,15 +248,15 @@ def _parse_robotlaser(tokens: list[bytes]) -> _StampedLine:
     ``ROBOTLASER1 type start_angle field_of_view resolution maximum_range accuracy remission_mode n r1..rn
     m s1..sm laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv`` three safety fields and the trailer.
     """
-    start, field_of_view, resolution, maximum = _numbers(tokens, 2, 4)
+    start, field_of_view, resolution, maximum = map(float, tokens[2:6])
     count = _count(tokens[8])
     poses_at = 10 + count + _count(tokens[9 + count])
     stamp = _stamp(tokens, poses_at + 6 + 5)
-    poses = np.array(_numbers(tokens, poses_at, 6))
+    laser_pose, robot_pose = _pose(tokens, poses_at), _pose(tokens, poses_at + 3)
     increment = resolution if resolution > 0.0 else field_of_view / max(count - 1, 1)
     ranges = _ranges(tokens, 9, count)
     limit = maximum if maximum > 0.0 else np.inf
-    return _StampedLine(stamp, _Sweep(ranges, start, increment, limit, poses[3:], poses[:3], is_front=False))
+    return _StampedLine(stamp, _Sweep(ranges, start, increment, limit, robot_pose, laser_pose, is_front=False))
 
 
 _PARSERS: dict[bytes, Callable[[list[bytes]], _StampedLine]] = {
@@ -263,12 +281,12 @@ def _count(token: bytes) -> int:
 
 
 def _ranges(tokens: list[bytes], begin: int, count: int) -> NDArray[np.float32]:
-    with np.errstate(over="ignore"):  # beyond float32 there is no return
-        return np.array(_numbers(tokens, begin, count), dtype=np.float32)
+    return np.fromiter(map(float, tokens[begin : begin + count]), np.float32, count)
 
 
-def _numbers(tokens: list[bytes], begin: int, count: int) -> list[float]:
-    return list(map(float, tokens[begin : begin + count]))
+def _pose(tokens: list[bytes], begin: int) -> NDArray[np.float64]:
+    x, y, theta = tokens[begin : begin + 3]
+    return np.array((float(x), float(y), float(theta)))
 
 
 def _range_limits(sweeps: Sequence[_Sweep]) -> dict[float, float]:
@@ -279,10 +297,12 @@ def _range_limits(sweeps: Sequence[_Sweep]) -> dict[float, float]:
     by_maximum: dict[float, list[NDArray[np.float32]]] = {}
     for sweep in sweeps:
         by_maximum.setdefault(sweep.stated_max, []).append(sweep.ranges)
-    return {
-        stated: min(no_return_threshold(np.concatenate(ranges)), float(np.float32(stated)))
-        for stated, ranges in by_maximum.items()
-    }
+    limits = {}
+    for stated, parts in by_maximum.items():
+        ranges = np.concatenate(parts)
+        ranges.sort()
+        limits[stated] = min(_threshold_of_sorted(ranges), float(np.float32(stated)))
+    return limits
 
 
 class _Mountings:
@@ -294,7 +314,7 @@ class _Mountings:
     """
 
     def __init__(self, sweeps: Sequence[_Sweep], front_laser_offset: float) -> None:
-        self._known = np.empty((0, 3))
+        self._known = self._inverses = np.empty((0, 3))
         front = _constant_offset([sweep for sweep in sweeps if sweep.is_front])
         self._front = np.array([front_laser_offset, 0.0, 0.0]) if front is None else front
 
@@ -306,13 +326,14 @@ class _Mountings:
         if sweep.is_front:
             return self._front
         offset = se2.between(sweep.robot_pose, sweep.laser_pose)
-        same = np.flatnonzero((np.abs(se2.between(self._known, offset)) < _SAME_OFFSET).all(axis=1))
+        same = np.flatnonzero((np.abs(se2.compose(self._inverses, offset)) < _SAME_OFFSET).all(axis=1))
         if not same.size:
             if len(self._known) == _MAX_OFFSETS:
                 raise HmtSlamError(
                     f"the laser has more than {_MAX_OFFSETS} poses on the robot: give a log with a laser that is fixed."
                 )
             self._known = np.vstack([self._known, np.round(offset, 4)])
+            self._inverses = se2.inverse(self._known)
             return self._known[-1]
         known: NDArray[np.float64] = self._known[same[0]]
         return known
