@@ -34,6 +34,7 @@ class Case:
     :ivar duration: seconds of the log that are used, 0 for all.
     :ivar start: seconds of the log that are skipped.
     :ivar source: output folder whose map is extended, None for none.
+    :ivar jobs: OS processes of the run.
     """
 
     log: MeasuredLog
@@ -43,6 +44,7 @@ class Case:
     duration: float = 0.0
     start: float = 0.0
     source: Path | None = None
+    jobs: int = 1
 
     @property
     def name(self) -> str:
@@ -51,12 +53,14 @@ class Case:
         section = "_".join(
             f"{name}_{seconds:g}" for name, seconds in (("from", self.start), ("for", self.duration)) if seconds
         )
-        return "-".join(filter(None, (self.log.name, self.kind, changes, section, str(self.seed))))
+        jobs = f"jobs_{self.jobs}" if self.jobs > 1 else ""
+        return "-".join(filter(None, (self.log.name, self.kind, changes, section, jobs, str(self.seed))))
 
     def command(self, folder: Path) -> list[str]:
         """The command line that maps the log into a folder."""
         program = ["benchmark.degraded_odometry", self.kind] if self.kind else ["hmt_slam_ros.cli.main", "map"]
         options = ["--out", str(folder), "--seed", str(self.seed), "--config", str(PARAMETERS)]
+        options += ["--jobs", str(self.jobs)]
         section = {"--duration": self.duration, "--start": self.start, "--from": self.source}
         section_words = [word for name, value in section.items() if value for word in (name, str(value))]
         changes = [word for change in self.changes for word in ("--set", change)]

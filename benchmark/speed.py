@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -41,8 +42,8 @@ POLICY = (
     "count. CPU time is user and system time of the process and its children, from start to exit, including reading "
     "the log and writing the folder; memory is the largest resident set. A scan's cost is wall time; its mean, its 95 "
     "% quantile and its maximum are over all scans of a log. The mean of the first two and the maximum of the third "
-    "are over the seeds. Start times are medians of five; on a busy machine DDS may miss the first announcement of a "
-    "node, which adds 3 s of wall time."
+    "are over the seeds. Runs in two OS processes follow those in one. Start times are medians of five; on a busy "
+    "machine DDS may miss the first announcement of a node, which adds 3 s of wall time."
 )
 
 
@@ -54,8 +55,11 @@ def measure_speed(settings: Settings) -> Report:
     with open_logs(settings.logs_or(WITH_RELATIONS)) as logs:
         with tempfile.TemporaryDirectory(prefix="hmt_slam_benchmark_") as folder:
             Runner(Path(folder), jobs=1).runs([Case(log, 0, changes=settings.changes) for log in logs])
-        runs = {log.name: runner.runs([Case(log, seed, changes=settings.changes) for seed in seeds]) for log in logs}
+        cases = {log.name: [Case(log, seed, changes=settings.changes) for seed in seeds] for log in logs}
+        runs = {name: runner.runs(own) for name, own in cases.items()}
+        pairs = {name: runner.runs([replace(case, jobs=2) for case in own]) for name, own in cases.items()}
     _report_runs(report, runs)
+    report.body.append(_pair_table(runs, pairs))
     for name, own in runs.items():
         shutil.copy(plot_cost(own[0].folder), settings.out / f"cost-{name}.png")
         report.pictures[f"cost-{name}.png"] = f"Computing time of every process for every scan of {name}."
@@ -76,6 +80,19 @@ def _report_runs(report: Report, runs: dict[str, list[Run]]) -> None:
         ]
         for name, own in runs.items()
     }
+
+
+def _pair_table(runs: dict[str, list[Run]], pairs: dict[str, list[Run]]) -> str:
+    """Runs in two OS processes, against those in one."""
+    head = ["log, two OS processes", "wall time [s]", "ratio to one", "CPU time [s]", "ratio to one"]
+    rows = []
+    for name, own in pairs.items():
+        row = [name]
+        for figure in ("wall_seconds", "cpu_seconds"):
+            pair, one = (statistics.mean(getattr(run, figure) for run in all_runs) for all_runs in (own, runs[name]))
+            row += [f"{pair:.1f}", f"{pair / one:.2f}"]
+        rows.append(row)
+    return table(head, rows)
 
 
 def speed_requirements(name: str, cpu_seconds: Sequence[float], peak_rss: Sequence[int]) -> list[Requirement]:
