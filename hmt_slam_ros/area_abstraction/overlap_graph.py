@@ -261,10 +261,28 @@ def _orders(similarity: Float64) -> list[NDArray[np.intp]]:
     # x = D^-1/2 y with y an eigenvector of the symmetric I - D^-1/2 A D^-1/2.
     laplacian = np.eye(n) - scale[:, None] * joined * scale
     # Each component beyond the first has an eigenvalue near 0; the next solution bisects a component.
-    components = scipy.sparse.csgraph.connected_components(similarity > 0.0, directed=False)[0]
-    last = min(n - 1, components + 1)
+    last = min(n - 1, _count_components(similarity) + 1)
     vectors = scipy.linalg.eigh(laplacian, subset_by_index=(0, last))[1]
     return [np.argsort(scale * vector, kind="stable") for vector in vectors.T]
+
+
+@njit(cache=True)
+def _count_components(similarity: Float64) -> int:
+    """Number of connected components of a graph."""
+    n = len(similarity)
+    is_reached, stack, components = np.zeros(n, np.bool_), np.empty(n, np.int64), 0
+    for start in range(n):
+        components += not is_reached[start]
+        size = int(not is_reached[start])
+        is_reached[start], stack[0] = True, start
+        while size > 0:
+            size -= 1
+            node = stack[size]
+            for other in range(n):
+                if similarity[node, other] > 0.0 and not is_reached[other]:
+                    is_reached[other], stack[size] = True, other
+                    size += 1
+    return components
 
 
 def _sweep(similarity: Float64, order: NDArray[np.intp], min_size: int, sizes: Int64) -> Cut | None:
