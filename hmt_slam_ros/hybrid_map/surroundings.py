@@ -185,8 +185,17 @@ def keyframe_positions(hybrid_map: HybridMap, area: int, pose: Pose = _ORIGIN) -
 
 def min_distance(a: Float64, b: Float64) -> float:
     """Distance between the nearest points of two sets (n, 2), (m, 2), m; inf where one is empty."""
-    between = a[:, None] - b[None]
-    return float(np.hypot(between[..., 0], between[..., 1]).min(initial=np.inf))
+    return float(_min_distance(np.ascontiguousarray(a), np.ascontiguousarray(b)))
+
+
+@njit(cache=True)
+def _min_distance(a: Float64, b: Float64) -> float:
+    """:func:`min_distance`, without arrays of all pairs."""
+    smallest = np.inf
+    for i in range(len(a)):
+        for j in range(len(b)):
+            smallest = min(smallest, np.hypot(a[i, 0] - b[j, 0], a[i, 1] - b[j, 1]))
+    return smallest
 
 
 def consistent_pose(
