@@ -105,6 +105,19 @@ def test_the_grids_that_are_kept_take_bounded_memory(views):
     assert views.grid({0: np.zeros(3)}) is not first
 
 
+def test_the_least_recently_used_grids_are_packed(views, monkeypatch):
+    poses = [{0: np.array([0.0, 0.0, 0.05 * k])} for k in range(4)]
+    first = views.grid(poses[0])
+    views._grids._unpacked_bytes = 2 * first.nbytes
+    others = [views.grid(pose) for pose in poses[1:]]
+    assert views.grid(poses[3]) is others[2]
+    monkeypatch.setattr("hmt_slam_ros.hybrid_map.surroundings.build_area_grid", None)
+    again = views.grid(poses[0])
+    assert again is not first
+    assert again.fine_log_ratio.tobytes() == first.fine_log_ratio.tobytes()
+    assert views.grid(poses[0]) is again
+
+
 def test_a_coarse_grid_outlasts_grids(views):
     grid, coarse = views.grid({0: np.zeros(3)}), views.coarse_grid({0: np.zeros(3)})
     for k in range(40):

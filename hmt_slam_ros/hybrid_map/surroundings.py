@@ -11,7 +11,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -22,11 +22,13 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel, build_area_grid, build_coarse_grid
+from hmt_slam_ros.registration.packed_grid import pack_log_ratio_grid
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 from hmt_slam_ros.sensors import Scan
 
 Pose = Float64
 Grid = TypeVar("Grid")
+Unpacked_co = TypeVar("Unpacked_co", covariant=True)
 
 _ORIGIN = np.zeros(3)
 """Pose of a frame in itself."""
@@ -44,10 +46,15 @@ _MAX_NEIGHBORS = 64
 """Most areas around an area; bounds the work where tight arcs join hundreds."""
 
 _CACHE_BYTES = 4 << 25
-"""Size of the grids that are cached, bytes: those of about thirty places, with which a comparison is made at most."""
+"""Size of the grids that are cached, as if none were packed, bytes: those of about thirty places, with which a
+comparison is made at most.
+"""
 
 _COARSE_CACHE_BYTES = 3 << 25
 """Size of the coarse grids that global localization needs again and again, bytes: those of about forty regions."""
+
+_UNPACKED_BYTES = 1 << 25
+"""Size of the cached grids that are not packed, bytes; on Intel Lab no other is used again."""
 
 _COARSE_SPEED = 3
 """Cells of a coarse grid that are made in the time of one of a grid."""
@@ -239,21 +246,35 @@ class GridCacheState:
     coarse_grids: tuple[KnownGrid, ...] = ()
 
 
-class _RecentGrids(Generic[Grid]):
-    """Grids of keyframes at poses, of which the least recently used are evicted.
+class _Packed(Protocol[Unpacked_co]):
+    """A packed grid."""
 
-    :ivar known: {key: size, bytes} of those that are held, or were when the cache was saved.
+    def unpack(self) -> Unpacked_co: ...
+
+
+class _RecentGrids(Generic[Grid]):
+    """Grids of keyframes at poses, of which the least recently used are packed, and at last evicted.
+
+    :ivar known: {key: size unpacked, bytes} of those that are held, or were when the cache was saved.
     """
 
-    def __init__(self, max_bytes: int) -> None:
-        """:param max_bytes: their size, bytes; the newest one is kept in any case."""
-        self._max_bytes = max_bytes
+    def __init__(
+        self, pack: Callable[[Grid], _Packed[Grid]], max_bytes: int, unpacked_bytes: int = _UNPACKED_BYTES
+    ) -> None:
+        """:param max_bytes: size of all, as if unpacked, bytes; the newest one is kept in any case.
+
+        :param unpacked_bytes: size of those that are not packed, likewise.
+        """
+        self._pack = pack
+        self._max_bytes, self._unpacked_bytes = max_bytes, unpacked_bytes
         self.known: OrderedDict[int, int] = OrderedDict()
-        self._grids: dict[int, Grid] = {}
+        self._grids: OrderedDict[int, Grid] = OrderedDict()
+        self._packed: dict[int, _Packed[Grid]] = {}
 
     def clear(self) -> None:
         self.known.clear()
         self._grids.clear()
+        self._packed.clear()
 
     def get(
         self,
@@ -266,17 +287,36 @@ class _RecentGrids(Generic[Grid]):
         :param rebuild: makes a grid again that was held when the cache was saved.
         """
         key = _key(keyframes)
-        if key not in self.known:
-            self._grids[key], self.known[key] = build(keyframes)
-            size = sum(self.known.values())
-            while size > self._max_bytes and len(self.known) > 1:
-                evicted, own = self.known.popitem(last=False)
-                self._grids.pop(evicted, None)
-                size -= own
-        elif key not in self._grids:
-            self._grids[key], _ = rebuild(keyframes)
+        if key in self._grids:
+            grid = self._grids.pop(key)
+        elif key in self._packed:
+            grid = self._packed[key].unpack()
+        elif key in self.known:
+            grid, _ = rebuild(keyframes)
+        else:
+            grid, self.known[key] = build(keyframes)
+            self._evict()
+        self._grids[key] = grid
         self.known.move_to_end(key)
-        return self._grids[key]
+        self._pack_oldest()
+        return grid
+
+    def _evict(self) -> None:
+        size = sum(self.known.values())
+        while size > self._max_bytes and len(self.known) > 1:
+            evicted, own = self.known.popitem(last=False)
+            self._grids.pop(evicted, None)
+            self._packed.pop(evicted, None)
+            size -= own
+
+    def _pack_oldest(self) -> None:
+        """Pack the least recently used grids; one that was packed before stays so while it is unpacked, too."""
+        size = sum(self.known[key] for key in self._grids)
+        while size > self._unpacked_bytes and len(self._grids) > 1:
+            key, grid = self._grids.popitem(last=False)
+            size -= self.known[key]
+            if key not in self._packed:
+                self._packed[key] = self._pack(grid)
 
 
 def _key(keyframes: Mapping[int, Pose]) -> int:
@@ -290,7 +330,7 @@ def _ignore(_: int) -> None:
 
 
 class GridCache:
-    """Grids and places, built from the keyframes' scans. The least recently used grids are evicted."""
+    """Grids and places, built from the keyframes' scans. The least recently used grids are packed, then evicted."""
 
     def __init__(
         self,
@@ -310,8 +350,8 @@ class GridCache:
         self._model = model
         self._neighborhood = neighborhood
         self._count_cells = count_cells
-        self._grids = _RecentGrids[AreaGrid](max_bytes)
-        self._coarse_grids = _RecentGrids[LogRatioGrid](_COARSE_CACHE_BYTES)
+        self._grids = _RecentGrids[AreaGrid](AreaGrid.pack, max_bytes)
+        self._coarse_grids = _RecentGrids[LogRatioGrid](pack_log_ratio_grid, _COARSE_CACHE_BYTES)
 
     @property
     def state(self) -> GridCacheState:

@@ -8,12 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Bool, Float32, Float64, Int32, Int64
+from hmt_slam_ros.arrays import Bool, Float32, Float64, Int32, Int64, UInt8
 from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.se2 import transform_point
 from hmt_slam_ros.registration.consistency import Agreement
+from hmt_slam_ros.registration.packed_grid import PackedRatios, pack_ratios, unpack_flags
 from hmt_slam_ros.registration.search_bounds import LogRatioGrid
 from hmt_slam_ros.sensors import Scan
 
@@ -105,6 +106,30 @@ class AreaGrid:
         """
         on, free = _count_agreement(se2.transform(pose, points), self.fine_log_ratio, self.origin, 0.5 * self.cell)
         return Agreement(len(points), on, free)
+
+    def pack(self) -> PackedAreaGrid:
+        """The grid, packed."""
+        fine = pack_ratios(self.fine_log_ratio)
+        return PackedAreaGrid(self.origin, self.cell, fine, np.packbits(self.free), self.points)
+
+
+class PackedAreaGrid(NamedTuple):
+    """A packed :class:`AreaGrid`.
+
+    :ivar free: shape (ceil(rows * columns / 8),), bits.
+    """
+
+    origin: Float64
+    cell: float
+    fine_log_ratio: PackedRatios
+    free: UInt8
+    points: Float64
+
+    def unpack(self) -> AreaGrid:
+        """The grid."""
+        fine = self.fine_log_ratio.unpack()
+        free = unpack_flags(self.free, (fine.shape[0] // 2, fine.shape[1] // 2))
+        return AreaGrid(self.origin, self.cell, _downsample(fine), fine, free, self.points)
 
 
 def build_area_grid(scans: Sequence[Scan], poses: Float64, model: GridModel) -> AreaGrid:
