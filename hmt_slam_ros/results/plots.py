@@ -128,7 +128,7 @@ class _GridArtist(Artist):
         colors = np.full((height, width, 4), 255, np.uint8)
         colors[..., :3] = gray[..., None]
         if self._walls_only:
-            colors[gray != OCCUPIED, 3] = 0
+            colors[..., 3] *= gray == OCCUPIED
         renderer.draw_image(renderer.new_gc(), left, bottom, colors)
 
 
