@@ -72,18 +72,20 @@ def occupancy_image(scans: Sequence[Scan], poses: Float64, resolution: float, ma
         resolution *= 2.0
     origin = np.floor(low / resolution) * resolution
     width, height = (np.ceil((high - origin) / resolution).astype(int) + 1).tolist()
+    # Zeros that no beam touches take no memory, and most cells of a large map are such.
     votes = np.zeros((3, height, width), dtype=np.int32)
-    votes[_LAST_SCAN] = -1
-    for k, (starts, ends, returned) in enumerate(beams):
+    for k, (starts, ends, returned) in enumerate(beams, start=1):
         _vote((starts - origin) / resolution, (ends - origin) / resolution, returned, k, votes)
     return OccupancyImage(_classify(votes[_HITS], votes[_MISSES])[::-1], resolution, origin)
 
 
 def _classify(hits: Int32, misses: Int32) -> UInt8:
-    votes = hits + misses
+    """The pixels of cells, row by row, which takes little memory besides."""
     pixels = np.full(hits.shape, UNKNOWN)
-    pixels[votes > 0] = FREE
-    pixels[(votes > 0) & (hits >= _OCCUPIED_RATIO * votes)] = OCCUPIED
+    for row, row_hits, row_misses in zip(pixels, hits, misses, strict=True):
+        votes = row_hits + row_misses
+        row[votes > 0] = FREE
+        row[(votes > 0) & (row_hits >= _OCCUPIED_RATIO * votes)] = OCCUPIED
     return pixels
 
 
@@ -102,7 +104,10 @@ def _vote(
     scan: int,
     votes: Int32,
 ) -> None:
-    """Add the votes of one scan: at most one per cell, hits before misses. Coordinates in cells."""
+    """Add the votes of one scan: at most one per cell, hits before misses. Coordinates in cells.
+
+    :param scan: its number, from 1 on.
+    """
     for k in range(ends.shape[0]):
         i, j = math.floor(ends[k, 1]), math.floor(ends[k, 0])
         if returned[k] and votes[_LAST_SCAN, i, j] != scan:
