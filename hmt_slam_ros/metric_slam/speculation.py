@@ -27,8 +27,8 @@ from hmt_slam_ros.submap.local_filter import FilterFactory
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 from hmt_slam_ros.submap.particle_filter import ParticleFilters
 
-_MOST_FORKS = 8
-"""Keyframe events whose answers may be due; more copies only make a wrong assumption dearer."""
+_MOST_FORKS = 2
+"""Keyframe events whose answers may be assumed; more make a wrong assumption dearer."""
 
 
 @dataclass
