@@ -55,6 +55,10 @@ class Manager:
         assert answer is not None, f"{node} does not say its state"
         return answer.current_state.label
 
+    def until(self, node, state):
+        """Wait for a state that the node comes to by itself, which may compile its kernels first."""
+        self.listener.until(lambda: self.state(node) == state, seconds=150.0)
+
     def change(self, node, transition):
         """Whether the node did it; a transition is given by its name or its number."""
         request, before = ChangeState.Request(), self.state(node)
@@ -192,9 +196,10 @@ def test_a_node_that_cannot_be_configured_says_why_and_stays(listener, start, tm
 
 
 def test_a_node_that_is_killed_comes_back_in_the_state_in_which_it_was(listener, start, tmp_path):
-    reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    reported, manager = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM), Manager(listener)
     node = start("rtl", recovery=tmp_path)
-    assert Manager(listener).change("rtl", "deactivate")
+    manager.until("rtl", "active")
+    assert manager.change("rtl", "deactivate")
     node.send_signal(signal.SIGKILL)
     node.communicate()
     received = len(reported)
