@@ -107,12 +107,19 @@ def assert_permissions(listener, nodes):
             assert allowed - used <= SOMETIMES.keys(), (node, qualifier, allowed - used)
 
 
+def ready_nodes(reported):
+    """Names of the nodes that are active, or have no states."""
+    status = {status.name: status for one in reported for status in one.status}
+    states = {name: {value.key: value.value for value in one.values}.get("state") for name, one in status.items()}
+    return {name for name, state in states.items() if state in (None, "active")}
+
+
 @pytest.mark.parametrize("nodes", [PROCESSES, COMPANIONS], ids=["processes", "companions"])
 def test_running_nodes_use_what_their_enclaves_allow(listener, start, nodes):
     processes = [start(name, **parameters) for name, parameters in nodes.items()]
     reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     names = {f"/{name}" for name in nodes}
-    listener.until(lambda: {status.name for one in reported for status in one.status} >= names, alive=processes)
+    listener.until(lambda: ready_nodes(reported) >= names, alive=processes)
     listener.until(lambda: set(listener.node.get_node_names()) >= set(nodes), alive=processes)
     assert_permissions(listener, nodes)
 
