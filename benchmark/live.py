@@ -184,6 +184,8 @@ def measure_scans(log: str, seconds: float, tsbi: Sequence[str] = ()) -> ScanTim
         record = EarlyEstimateRecord()
         early = _collect_estimates(listener, EarlyEstimate, record.add)
         final = _collect_estimates(listener, LocalEstimate, record.compare)
+        # The first early estimates would be lost otherwise.
+        listener.wait_until(lambda: listener.node.count_publishers(DOCUMENTS[EarlyEstimate]) > 0)
         _play_log(listener, log, seconds, SCAN)
         listener.wait_until(lambda: len(final) >= len(sent), _TIMEOUT)
         first = {stamp: min(moment, early.get(stamp, moment)) for stamp, moment in final.items()}

@@ -14,6 +14,7 @@ _COMPOSITION = "hmt_slam_ros.composition"
 _MESSAGES = "hmt_slam_ros.messages.messages"
 _DOCUMENTS = "hmt_slam_ros.messages.documents"
 _ROS = "hmt_slam_ros.ros"
+_TOPOLOGY_NICENESS = 5  # a quarter of a core beside a program of niceness 0
 
 RUN_NODE = f"{_ROS}.run_node"
 """Module that runs any node by its name."""
@@ -52,12 +53,14 @@ class ProcessRow(NodeRow):
     :ivar factory: "module:function" or "module:Class" that makes the process from a configuration and a state or None.
     :ivar state: "module:Class" of its state; without arguments the class is the state before the first message.
     :ivar produces: names of the message classes that it sends; ``Notice`` is implied.
+    :ivar niceness: of its node, 0 to 19; on a busy processor those with less come first.
     """
 
     node_class: str = f"{_ROS}.process_node:ProcessNode"
     factory: str = ""
     state: str = ""
     produces: tuple[str, ...] = ()
+    niceness: int = 0
 
     @property
     def state_class(self) -> type[Any]:
@@ -112,6 +115,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
         state="hmt_slam_ros.area_abstraction.partition:AamState",
         libraries=("scipy.linalg", "scipy.sparse.csgraph"),
         produces=("AreaEvents",),
+        niceness=_TOPOLOGY_NICENESS,
     ),
     ProcessRow(
         name="tsbi",
@@ -122,6 +126,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
         state="hmt_slam_ros.topological_inference.tsbi:TsbiState",
         libraries=("scipy.special",),
         produces=("Hypotheses",),
+        niceness=_TOPOLOGY_NICENESS,
     ),
     ProcessRow(
         name="tlca",
@@ -132,6 +137,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
         state="hmt_slam_ros.loop_closure.tlca:TlcaState",
         libraries=("scipy.sparse.csgraph", "scipy.sparse.linalg"),
         produces=("ClosureDecision",),
+        niceness=_TOPOLOGY_NICENESS,
     ),
     ProcessRow(
         name="rtl",

@@ -91,6 +91,11 @@ class ScanQueue:
         """
         return ScanQueue(self._max_waiting, odometry, self.state)
 
+    @property
+    def waits_for_odometry(self) -> bool:
+        """Whether scans wait for odometry."""
+        return self._state.waits_for_odometry
+
     def add_odometry(self, odometry: Odometry) -> None:
         """Add a reading."""
         self._odometry.add(odometry)

@@ -104,6 +104,9 @@ class MetricSlam:
     ScanPoses, LocalEstimate, Notice, EndOfRun; and EarlyEstimate, where :meth:`look_ahead` is called.
 
     :ivar mode: mapping, localization or lifelong; a lost robot maps its surroundings in every mode.
+    :ivar batch_size: most scans that are processed at a stretch, None for all that are ready.
+    :ivar is_interrupted: whether scans are left since a batch was full; then measurements wait for the next
+        :meth:`process_queue`.
     """
 
     def __init__(
@@ -141,6 +144,8 @@ class MetricSlam:
         )
         self._ended = False
         # Not part of the state, since no decision depends on them.
+        self.batch_size: int | None = None
+        self.is_interrupted = False
         self._is_fork = False
         self._look_ahead: LookAhead | None = None
         self._next_early = 0
@@ -233,18 +238,23 @@ class MetricSlam:
     def handle(self, message: Message) -> list[Message]:
         """Process a message, and the scans that are ready then; returns the answers."""
         if isinstance(message, Odometry | Scan):
-            return self.enqueue(message) + self.process_queue()
+            notices = self.enqueue(message)
+            return notices if self.is_interrupted else notices + self.process_queue()
         self._look_ahead = None  # whose map changes
         if isinstance(message, Hypotheses):
             self._apply_hypotheses(message)
         elif isinstance(message, ClosureDecision):
             self._apply_decision(message)
         elif isinstance(message, PoseReset):
-            self._state = replace(self._state, initial_pose=message.initial_pose)
-            return [] if self._state.lost and message.initial_pose is not None else self._reset_tracking()
+            return self.finish_queue() + self._set_initial_pose(message.initial_pose)
         elif isinstance(message, EndOfLog):
             self._ended = True
+            return self.finish_queue()
         return self.process_queue()
+
+    def _set_initial_pose(self, initial_pose: InitialPose | None) -> list[Message]:
+        self._state = replace(self._state, initial_pose=initial_pose)
+        return [] if self._state.lost and initial_pose is not None else self._reset_tracking()
 
     def enqueue(self, measurement: Odometry | Scan) -> list[Message]:
         """Add a measurement; returns notices of its faults."""
@@ -326,6 +336,7 @@ class MetricSlam:
             other._scan_queue,
         )
         self._live_hypotheses, self._state = other._live_hypotheses, other._state
+        self.is_interrupted = other.is_interrupted
 
     def add_to_replica(self, keyframe: Keyframe) -> None:
         """Add a keyframe that a copy made."""
@@ -336,10 +347,22 @@ class MetricSlam:
         for live in self._live_hypotheses.values():
             live.filter.release()
 
+    def finish_queue(self) -> list[Message]:
+        """As :meth:`process_queue`, in one batch."""
+        batch_size, self.batch_size = self.batch_size, None
+        answers = self.process_queue()
+        self.batch_size = batch_size
+        return answers
+
     def process_queue(self) -> list[Message]:
-        """Process the scans that are ready, up to the next keyframe event; returns their messages."""
+        """Process a batch of the scans that are ready, up to the next keyframe event; returns their messages."""
         answers: list[Message] = []
+        left, self.is_interrupted = self.batch_size, False
         while not self._state.awaiting_decision and self._scan_queue.is_ready(ended=self._ended):
+            # Without odometry at once, before a reading lets them wait again.
+            if left == 0 and self._scan_queue.waits_for_odometry:
+                self.is_interrupted = True
+                break
             scan = self._scan_queue.next_scan
             stale = self._motion.settle_odometry(scan.stamp)
             if stale is None and not self._ended:
@@ -347,6 +370,7 @@ class MetricSlam:
             if stale:
                 answers += self._notices(self._odometry_monitor.add_stale_odometry(scan.stamp, stale))
             answers += self._process_scan(self._scan_queue.pop())
+            left = left and left - 1
         if self._ended and not self._scan_queue and not self._state.awaiting_decision:
             answers += self._finish()
         return answers

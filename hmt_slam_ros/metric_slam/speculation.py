@@ -103,6 +103,18 @@ class SpeculativeSlam(MetricSlam):
         return len(self._steps)
 
     @property
+    def has_more(self) -> bool:
+        """Whether scans are left since a batch was full."""
+        return self.is_interrupted or self._front.is_interrupted
+
+    def process_batch(self) -> list[Message]:
+        """Process the next batch; returns the messages whose turn has come."""
+        if self._front.is_interrupted and self._forks:
+            self._add_answers(self._front.process_queue())
+            return []
+        return self.process_queue()
+
+    @property
     def _front(self) -> MetricSlam:
         return self._forks[-1].slam if self._forks else self
 
@@ -153,7 +165,8 @@ class SpeculativeSlam(MetricSlam):
         for measurement in self._unseen:
             for fork in self._forks:
                 fork.slam.enqueue(measurement)
-            self._add_answers(self._front.process_queue())
+            if not self._front.is_interrupted:
+                self._add_answers(self._front.process_queue())
         self._unseen = []
 
     def _add_answers(self, answers: Sequence[Message]) -> None:

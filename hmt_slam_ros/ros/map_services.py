@@ -122,7 +122,8 @@ class RequestCoordinator(ABC):
 
     def start_if_ready(self) -> None:
         """Start a requested operation where no keyframe event is under way and all processes are there."""
-        if self._outcome is None or self.is_blocking or self._node.process.is_awaiting_decision:
+        process = self._node.process
+        if self._outcome is None or self.is_blocking or process.is_awaiting_decision or process.is_interrupted:
             return
         participants, subscribers = participant_names(), self._request_publisher.get_subscription_count()
         if subscribers < len(participants) and time.monotonic() - self._requested_at < _DISCOVERY_TIMEOUT:
@@ -132,7 +133,7 @@ class RequestCoordinator(ABC):
         self._number = max(self._number + 1, time.time_ns())
         try:
             self.is_blocking = True
-            request = self._make_request(self._number, self._node.process.keyframe_events)
+            request = self._make_request(self._number, process.keyframe_events)
             if subscribers < len(participants):
                 raise HmtSlamError(f"{subscribers} of {', '.join(participants)} are running: start all of them")
         except (HmtSlamError, OSError) as fault:

@@ -7,7 +7,7 @@ import signal
 import time
 import traceback
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from hmt_slam_ros.messages.messages import Message, Notice, RealTimePose, Tracki
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS
 from hmt_slam_ros.messages.routing import SUBSCRIPTIONS, Checkpointable, message_types
 from hmt_slam_ros.process_table import participant_names, process_row
-from hmt_slam_ros.ros.execution import force_exit_after, spin_until
+from hmt_slam_ros.ros.execution import force_exit_after, lower_priority, spin_until
 from hmt_slam_ros.ros.initial_state import InitialState, declare_start_from, declare_start_lost
 from hmt_slam_ros.ros.journal import UnreadableInput
 from hmt_slam_ros.ros.message_io import Inbox, Outbox
@@ -91,6 +91,7 @@ class ProcessNode(ParticipantNode):
 
         :raises HmtSlamError: where the node cannot start.
         """
+        lower_priority(process_row(self._name).niceness)
         self.enter_startup_states()
         has_ended = False
         try:
@@ -315,24 +316,32 @@ class ProcessNode(ParticipantNode):
         if isinstance(message, TrackingReset) and not self.is_recovering and self.recovery.is_repeated_reset(message):
             return
         self.recovery.record_input(message)
-        outputs: list[Message] = []
-        try:
-            self._handle(message, outputs)
-        except Exception as fault:
-            self._set_aside(message, fault)
+        if not self.compute(message, lambda: self.process.handle(message)):
             return
-        self._publish_all(message, outputs)
         if self.is_recovering:
             self._replayed.append(message)
         if self._participant is not None:
             self._participant.on_delivered(message)
         self._write_due_checkpoint()
 
-    def _handle(self, message: Message, outputs: list[Message]) -> None:
+    def compute(self, message: Message, work: Callable[[], list[Message]]) -> bool:
+        """Do work of the process, and publish its outputs.
+
+        :param message: the last input, which is set aside where the work fails.
+        :param work: returns the outputs.
+        :returns: whether it did not fail.
+        """
+        outputs: list[Message] = []
         begin = time.perf_counter()
-        with self.diagnostics.measure(message, outputs):
-            outputs += self.process.handle(message)
+        try:
+            with self.diagnostics.measure(message, outputs):
+                outputs += work()
+        except Exception as fault:
+            self._set_aside(message, fault)
+            return False
         self.recovery.add_busy_time(time.perf_counter() - begin)
+        self._publish_all(message, outputs)
+        return True
 
     def _publish_all(self, message: Message, outputs: list[Message]) -> None:
         """Publish outputs and views; a fault in that changes nothing in the process."""

@@ -67,6 +67,8 @@ class SlamNodeState:
 
 
 _NODE_STATE = "node"
+_BATCH_SIZE, _BATCH_PAUSE = 2, 0.002
+"""Scans that are processed at a stretch, and the time until the next, s, in which new scans get early estimates."""
 _END_TIMEOUT = 5.0
 """Time without scans after which the last ones of a log are no longer awaited, s."""
 
@@ -106,6 +108,7 @@ class SlamNode(MapServicesNode):
             first_unpublished_scan=state.first_unpublished_scan + offset,
         )
         process: SpeculativeSlam = row.make(self.configuration, state)
+        process.batch_size = _BATCH_SIZE
         return process
 
     def configure_node(self) -> None:
@@ -132,6 +135,8 @@ class SlamNode(MapServicesNode):
         self._early_estimates = EarlyEstimateRecord()
         self._adopt_map()
         self._held: deque[Message] = deque()
+        self._last_message: Message = PoseReset()
+        self._next_batch = self.create_timer(_BATCH_PAUSE, self._process_batch, clock=self.diagnostics.steady_clock)
         self._saver = MapSaver(self, self._deliver_held)
         self._loader = MapLoader(self, self._deliver_held)
         self._particles = self.create_publisher(PoseArray, PARTICLES, topics.STREAM)
@@ -181,6 +186,8 @@ class SlamNode(MapServicesNode):
 
     def on_configuration_changed(self, configuration: Configuration) -> None:
         """As any process node; another mode holds from the next keyframe on."""
+        if self.is_configured:
+            self._finish_queue()
         super().on_configuration_changed(configuration)
         if self.is_configured:
             self.process.mode = configuration.mode
@@ -284,7 +291,25 @@ class SlamNode(MapServicesNode):
             and not self.is_recovering
         ):
             super().deliver(PoseReset())
+        self._last_message = message
         super().deliver(message)
+        self._after_batch()
+
+    def _process_batch(self) -> None:
+        """Process the next scans that are ready; new ones are received between two batches."""
+        self._next_batch.cancel()
+        if self.process.has_more:
+            self.compute(self._last_message, self.process.process_batch)
+            self._after_batch()
+
+    def _finish_queue(self) -> None:
+        """Process all scans that are ready."""
+        if self.process.is_interrupted:
+            self.compute(self._last_message, self.process.finish_queue)
+
+    def _after_batch(self) -> None:
+        if self.process.has_more:
+            self._next_batch.reset()
         if self._end_status is not None:
             self._end_log_if_complete()
         self._saver.start_if_ready()
@@ -325,7 +350,8 @@ class SlamNode(MapServicesNode):
     @property
     def is_quiescent(self) -> bool:
         """Whether no scan waits for a transform, and nothing for a save or load."""
-        return not (self._scan_intake.waiting_count or self._held or self.is_blocking or self.is_busy)
+        is_waiting = self._scan_intake.waiting_count or self._held or self.process.is_interrupted
+        return not (is_waiting or self.is_blocking or self.is_busy)
 
     def node_state(self) -> dict[str, object]:
         """State of the node beside its process."""
