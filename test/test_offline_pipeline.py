@@ -87,8 +87,10 @@ def test_all_messages_and_states_are_those_of_lock_step(in_lock_step, monkeypatc
     assert found == state
     assert record.scans > 50
     assert record.confirmed > 10
-    assert record.refuted > 1
+    assert sum(record.refuted.values()) > 1
+    assert record.refuted["area"] > 0
     assert 0 < record.repeated < record.scans
+    assert record.dropped_seconds > 0.0
 
 
 class Faulty:

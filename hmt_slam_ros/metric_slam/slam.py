@@ -306,18 +306,25 @@ class MetricSlam:
         self._state = replace(self._state, awaiting_decision=False)
         return self.process_queue()
 
-    def is_unchanged_by(self, answer: Hypotheses | ClosureDecision) -> bool:
-        """Whether an answer leaves all filters, and what decides about them, as they are; areas and arcs may change."""
+    def change_by(self, answer: Hypotheses | ClosureDecision) -> str | None:
+        """What an answer changes in the filters, or in what decides about them; None where nothing is changed.
+
+        Areas and arcs may change all the same.
+        """
         if isinstance(answer, ClosureDecision):
-            return not answer.moved_keyframes and answer.hypothesis in (None, *self._only_hypothesis())
+            is_unchanged = not answer.moved_keyframes and answer.hypothesis in (None, *self._only_hypothesis())
+            return None if is_unchanged else "closure"
         hypotheses = answer.hypotheses
-        return (
-            {hypothesis.id for hypothesis in hypotheses} == self._live_hypotheses.keys()
-            and not any(_changes_filter(hypothesis) for hypothesis in hypotheses)
-            and not (answer.pruned_keyframes or answer.stale_beams)
-            and all(hypothesis.lost for hypothesis in hypotheses) == self._state.lost
-            and min(hypotheses, key=lambda h: (-h.probability, h.id)).id == self._replica.best_hypothesis
-        )
+        if {hypothesis.id for hypothesis in hypotheses} != self._live_hypotheses.keys():
+            return "hypotheses"
+        if any(_changes_filter(hypothesis) for hypothesis in hypotheses):
+            return "area"
+        if answer.pruned_keyframes or answer.stale_beams:
+            return "keyframes"
+        if all(hypothesis.lost for hypothesis in hypotheses) != self._state.lost:
+            return "lost"
+        best = min(hypotheses, key=lambda hypothesis: (-hypothesis.probability, hypothesis.id))
+        return None if best.id == self._replica.best_hypothesis else "hypotheses"
 
     def _only_hypothesis(self) -> list[int]:
         """The live hypothesis, where there is one."""

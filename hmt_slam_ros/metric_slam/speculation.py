@@ -7,9 +7,10 @@ processed again. Both ways the messages are those of metric SLAM alone, in the s
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from hmt_slam_ros.configuration.tree import Configuration
@@ -37,19 +38,24 @@ class SpeculationRecord:
 
     :ivar scans: number of scans that were processed ahead.
     :ivar confirmed: number of answers that were as assumed.
-    :ivar refuted: number of answers after which copies were dropped.
+    :ivar refuted: {cause: number of answers after which copies were dropped}; the causes are "area" and "hypotheses",
+        which began or ended, "closure", "keyframes" that were removed, "lost" for a robot that was or is, and "reset".
     :ivar repeated: number of scans that were processed again.
+    :ivar dropped_seconds: computing time of the copies that were dropped, s.
     """
 
     scans: int = 0
     confirmed: int = 0
-    refuted: int = 0
+    refuted: dict[str, int] = field(default_factory=dict)
     repeated: int = 0
+    dropped_seconds: float = 0.0
 
     def __str__(self) -> str:
-        answers = self.confirmed + self.refuted
+        answers = self.confirmed + sum(self.refuted.values())
+        causes = ", ".join(f"{cause} {count}" for cause, count in sorted(self.refuted.items()))
         return (
-            f"{self.confirmed} of {answers} answers as assumed, {self.repeated} of {self.scans} scans processed again"
+            f"{self.confirmed} of {answers} answers as assumed{causes and f' (others: {causes})'}, {self.repeated} of "
+            f"{self.scans} scans processed again, {self.dropped_seconds:.2f} s"
         )
 
 
@@ -60,11 +66,24 @@ class _Step(NamedTuple):
     answers: Sequence[Message]
 
 
-class _Fork(NamedTuple):
-    """A copy that assumes an answer, and the messages that follow the answer at once."""
+@dataclass
+class _Fork:
+    """A copy that assumes an answer.
+
+    :ivar answers: the messages that follow the answer at once.
+    :ivar seconds: computing time, s.
+    """
 
     slam: MetricSlam
-    answers: list[Message]
+    answers: list[Message] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def compute(self, work: Callable[[], list[Message]]) -> list[Message]:
+        """The messages of some work of the copy."""
+        begin = time.perf_counter()
+        answers = work()
+        self.seconds += time.perf_counter() - begin
+        return answers
 
 
 class SpeculativeSlam(MetricSlam):
@@ -110,7 +129,7 @@ class SpeculativeSlam(MetricSlam):
     def process_batch(self) -> list[Message]:
         """Process the next batch; returns the messages whose turn has come."""
         if self._front.is_interrupted and self._forks:
-            self._add_answers(self._front.process_queue())
+            self._go_on(self._front.process_queue)
             return []
         return self.process_queue()
 
@@ -125,10 +144,8 @@ class SpeculativeSlam(MetricSlam):
         return is_due and len(self._forks) < _MOST_FORKS and self.mode != "lifelong"
 
     def _fork_front(self) -> None:
-        fork = self._front.fork()
-        answers = fork.assume_unchanged()
-        self._forks.append(_Fork(fork, []))
-        self._add_answers(answers)
+        self._forks.append(_Fork(self._front.fork()))
+        self._go_on(self._front.assume_unchanged)
 
     def work_ahead(self, measurement: Scan | Odometry) -> bool:
         """Process a measurement before its turn, the first that was not; :meth:`handle` gets it later.
@@ -141,7 +158,7 @@ class SpeculativeSlam(MetricSlam):
         front = self._front
         if front is self or front.is_awaiting_decision:
             return False
-        answers = front.handle(measurement)
+        answers = self._forks[-1].compute(lambda: front.handle(measurement))
         self._steps.append(_Step(measurement, answers))
         self.record.scans += _count_scans(answers)
         return True
@@ -166,11 +183,12 @@ class SpeculativeSlam(MetricSlam):
             for fork in self._forks:
                 fork.slam.enqueue(measurement)
             if not self._front.is_interrupted:
-                self._add_answers(self._front.process_queue())
+                self._go_on(self._front.process_queue)
         self._unseen = []
 
-    def _add_answers(self, answers: Sequence[Message]) -> None:
-        """Add messages of the newest copy; its estimates are early ones."""
+    def _go_on(self, work: Callable[[], list[Message]]) -> None:
+        """Let the newest copy do some work; its estimates are early ones."""
+        answers = self._forks[-1].compute(work)
         self._forks[-1].answers.extend(answers)
         self.record.scans += _count_scans(answers)
         self._early += [
@@ -183,8 +201,8 @@ class SpeculativeSlam(MetricSlam):
         """As in :class:`MetricSlam`."""
         if isinstance(message, Scan | Odometry):
             return self._handle_measurement(message)
-        if self._forks and not self._is_as_assumed(message):
-            self._drop_forks()
+        if self._forks and (cause := self._contradiction(message)) is not None:
+            self._drop_forks(cause)
         if self._forks and isinstance(message, ClosureDecision):
             return self._adopt_fork(message)
         return super().handle(message)
@@ -198,10 +216,11 @@ class SpeculativeSlam(MetricSlam):
             self._unseen.append(measurement)
         return super().handle(measurement)
 
-    def _is_as_assumed(self, message: Message) -> bool:
-        if not isinstance(message, Hypotheses | ClosureDecision):
-            return False
-        return self._front.mode == self.mode and self.is_unchanged_by(message)
+    def _contradiction(self, message: Message) -> str | None:
+        """What a message changes that the copies assume, None where nothing."""
+        if isinstance(message, Hypotheses | ClosureDecision) and self._front.mode == self.mode:
+            return self.change_by(message)
+        return "reset"
 
     def _adopt_fork(self, decision: ClosureDecision) -> list[Message]:
         """Go on as the copy that assumed this answer; returns what it has sent since."""
@@ -219,11 +238,12 @@ class SpeculativeSlam(MetricSlam):
                 self.add_to_replica(answer)
         return list(answers)
 
-    def _drop_forks(self) -> None:
+    def _drop_forks(self, cause: str) -> None:
         for fork in self._forks:
             fork.slam.release()
             self.record.repeated += _count_scans(fork.answers)
-        self.record.refuted += 1
+            self.record.dropped_seconds += fork.seconds
+        self.record.refuted[cause] = self.record.refuted.get(cause, 0) + 1
         self.record.repeated += sum(_count_scans(step.answers) for step in self._steps)
         self._forks.clear()
         self._steps.clear()

@@ -79,7 +79,7 @@ class RunMetrics:
     :ivar cpu_seconds: CPU time of all OS processes together, s.
     :ivar refinement_seconds: CPU time of the final refinement, s.
     :ivar memory: {part of the program: bytes}, where it is known.
-    :ivar speculation: how often metric SLAM worked ahead, {name: count}; empty where it did not.
+    :ivar speculation: how often metric SLAM worked ahead, {name: value}; empty where it did not.
     """
 
     log: str
@@ -91,7 +91,7 @@ class RunMetrics:
     cpu_seconds: float
     refinement_seconds: float
     memory: Mapping[str, int] = field(default_factory=dict)
-    speculation: Mapping[str, int] = field(default_factory=dict)
+    speculation: Mapping[str, Any] = field(default_factory=dict)
 
 
 @contextmanager
