@@ -35,3 +35,30 @@ def test_scans_count_with_what_was_worked_out_of_them():
     assert scan_bytes([scan]) == bare
     points = scan.points
     assert scan_bytes([scan, scan]) == 2 * (bare + points.nbytes + np.count_nonzero(scan.valid))
+
+
+def test_a_scan_that_forgets_its_points_has_the_same_at_each_use():
+    scan = scan_in(box(-3, -3, 3, 3), (0.0, 0.0, 0.0), beams=181)
+    points = scan.points
+    assert scan.points is points
+    full = scan_bytes([scan])
+    scan.forget_points()
+    np.testing.assert_array_equal(scan.points, points)
+    assert scan_bytes([scan]) == full - points.nbytes
+
+
+RELEASED = """
+import numba
+from hmt_slam_ros.process_memory import proportional_set_size, release_code
+numba.njit(lambda x: x + 1)(1)
+before = proportional_set_size()
+release_code()
+print(before - proportional_set_size(), numba.njit(lambda x: x + 2)(1))
+"""
+
+
+def test_code_that_is_given_up_is_there_again_when_it_runs():
+    reported = subprocess.run([sys.executable, "-c", RELEASED], capture_output=True, text=True, check=True).stdout
+    released, result = map(int, reported.split())
+    assert released > 10_000_000
+    assert result == 3

@@ -53,7 +53,7 @@ comparison is made at most.
 _COARSE_CACHE_BYTES = 3 << 25
 """Size of the coarse grids that global localization needs again and again, bytes: those of about forty regions."""
 
-_UNPACKED_BYTES = 1 << 25
+_UNPACKED_BYTES = 1 << 23
 """Size of the cached grids that are not packed, bytes; on Intel Lab no other is used again."""
 
 _COARSE_SPEED = 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
@@ -19,6 +20,9 @@ FIRST_HYPOTHESIS = 0
 
 FIRST_AREA = 0
 """Id of the only area at the start."""
+
+_RECENT_SCANS = 100
+"""Scans of the last keyframes, whose points are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +61,7 @@ class Replica:
     probabilities: dict[int, float] = field(default_factory=lambda: {FIRST_HYPOTHESIS: 1.0})
     robot_areas: dict[int, int] = field(default_factory=lambda: {FIRST_HYPOTHESIS: FIRST_AREA})
     contested: set[int] = field(default_factory=set)
+    _recent_scans: deque[Scan] = field(default_factory=deque)
 
     @classmethod
     def from_state(cls, state: ReplicaState) -> Replica:
@@ -116,8 +121,15 @@ class Replica:
             if estimate.stored:
                 hybrid_map.set_keyframe(keyframe.sequence, estimate.area, estimate.pose.mean)
                 self.scans[keyframe.sequence] = keyframe.scan
+                self._keep_in_few_bytes(keyframe.scan)
                 if len(self.maps) > 1:
                     self.contested.add(keyframe.sequence)
+
+    def _keep_in_few_bytes(self, scan: Scan) -> None:
+        """Keep the points of a new keyframe, and let those of an earlier one be forgotten."""
+        self._recent_scans.append(scan)
+        if len(self._recent_scans) > _RECENT_SCANS:
+            self._recent_scans.popleft().forget_points()
 
     def apply_hypotheses(self, hypotheses: Hypotheses) -> None:
         """Branch, change and drop hypotheses, revise scans and prune keyframes."""

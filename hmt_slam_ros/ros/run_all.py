@@ -13,13 +13,22 @@ import signal
 import sys
 import traceback
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 
 from hmt_slam_ros.kernel_loading import KernelLoading
+from hmt_slam_ros.process_memory import release_code
 from hmt_slam_ros.process_table import process_names, process_row, resolve, resolve_class
 from hmt_slam_ros.ros.child_processes import FAULT, PARENT_VARIABLE, RestartLimit
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_MODULES = (
+    *("asyncio", "inspect", "multiprocessing", "yaml"),
+    *("diagnostic_msgs.msg", "geometry_msgs.msg", "lifecycle_msgs.srv", "nav_msgs.msg", "nav_msgs.srv"),
+    *("rcl_interfaces.srv", "rosgraph_msgs.msg", "sensor_msgs.msg", "std_msgs.msg", "std_srvs.srv"),
+    "visualization_msgs.msg",
+)
+"""Modules that rclpy and the nodes import, and that start no thread."""
 _MAX_NAME = 15
 """Characters of the name of an OS process."""
 
@@ -42,9 +51,12 @@ def _load_libraries() -> None:
         resolve(row.factory)
         resolve_class(row.state)
         KernelLoading(name).load_cached()
+    for module in _MODULES:
+        import_module(module)
     assert len(list(Path("/proc/self/task").iterdir())) == 1, "threads do not survive a fork"
     gc.collect()
     gc.freeze()
+    release_code()  # of the compiler, which cached kernels need once
 
 
 class _ForkedNodes:

@@ -103,6 +103,8 @@ class Scan:
     motion: Float64 = field(default_factory=partial(np.zeros, 3))
     starts: Float32 | None = None
     _revised: tuple[BeamRevision, Scan] | None = field(default=None, init=False, repr=False)
+    _points: Float64 | None = field(default=None, init=False, repr=False)
+    _keeps_points: bool = field(default=True, init=False, repr=False)
 
     def __post_init__(self) -> None:
         numbers = (self.angle_min, self.angle_increment, self.range_min, self.range_max, self.time_increment)
@@ -125,10 +127,20 @@ class Scan:
         """Beams with a return, shape (n,)."""
         return _valid_mask(self.ranges, np.float32(max(self.range_min, 1e-3)), np.float32(self.range_max))
 
-    @cached_property
+    @property
     def points(self) -> Float64:
         """End points of the beams with a return, shape (k, 2), meters, robot base frame."""
-        return self._deskew(self._points_along_beams(self.ranges))
+        if self._points is not None:
+            return self._points
+        points = self._deskew(self._points_along_beams(self.ranges))
+        if self._keeps_points:
+            object.__setattr__(self, "_points", points)
+        return points
+
+    def forget_points(self) -> None:
+        """Keep the ranges alone; the points, of four times their memory, are computed at each use from now on."""
+        object.__setattr__(self, "_points", None)
+        object.__setattr__(self, "_keeps_points", False)
 
     def _points_along_beams(self, ranges: Float32) -> Float64:
         """Points on the beams with a return, shape (k, 2), in the frame of the base at each beam.
