@@ -139,6 +139,8 @@ def load():
 
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
         run_map(build_parser().parse_args(["map", str(LOG), "--out", f"{folder}/out"]))
+    # What is in the buffer would be printed by each fork.
+    sys.stdout.flush()
     assert len(list(Path("/proc/self/task").iterdir())) == 1, "threads do not survive a fork"
 
 

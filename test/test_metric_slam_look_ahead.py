@@ -70,6 +70,16 @@ def test_between_batches_of_scans_that_wait_a_new_one_has_an_estimate():
     assert pickle.dumps(batches.answers) == pickle.dumps(plain.answers)
 
 
+def test_an_answer_that_comes_while_its_event_is_not_reached_is_that_of_a_killed_process():
+    batches, plain = late_answer(2), late_answer()
+    second = plain.messages_of(Keyframe)[1]
+    for dialogue in (batches, plain):
+        dialogue.send(*agree(second))
+    while batches.slam.is_interrupted:
+        batches.answers += batches.slam.process_queue()
+    assert pickle.dumps(batches.answers) == pickle.dumps(plain.answers)
+
+
 @pytest.mark.parametrize("last", [PoseReset(), EndOfLog()])
 def test_all_that_wait_are_processed_before_anything_but_a_measurement(last):
     batches, plain = late_answer(2), late_answer()

@@ -49,11 +49,11 @@ def test_a_scan_that_forgets_its_points_has_the_same_at_each_use():
 
 RELEASED = """
 import numba
-from hmt_slam_ros.process_memory import proportional_set_size, release_code
+from hmt_slam_ros.process_memory import current_rss, release_code
 numba.njit(lambda x: x + 1)(1)
-before = proportional_set_size()
+before = current_rss()
 release_code()
-print(before - proportional_set_size(), numba.njit(lambda x: x + 2)(1))
+print(before - current_rss(), numba.njit(lambda x: x + 2)(1))
 """
 
 

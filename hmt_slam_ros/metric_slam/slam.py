@@ -241,15 +241,19 @@ class MetricSlam:
             notices = self.enqueue(message)
             return notices if self.is_interrupted else notices + self.process_queue()
         self._look_ahead = None  # whose map changes
+        # A killed process had done so before it sent what this answers.
+        answers = self.finish_queue() if self.is_interrupted else []
+        return answers + self._handle_answer_or_request(message)
+
+    def _handle_answer_or_request(self, message: Message) -> list[Message]:
+        if isinstance(message, PoseReset):
+            return self._set_initial_pose(message.initial_pose)
         if isinstance(message, Hypotheses):
             self._apply_hypotheses(message)
         elif isinstance(message, ClosureDecision):
             self._apply_decision(message)
-        elif isinstance(message, PoseReset):
-            return self.finish_queue() + self._set_initial_pose(message.initial_pose)
         elif isinstance(message, EndOfLog):
             self._ended = True
-            return self.finish_queue()
         return self.process_queue()
 
     def _set_initial_pose(self, initial_pose: InitialPose | None) -> list[Message]:

@@ -73,6 +73,7 @@ class ProcessNode(ParticipantNode):
         """Declare the parameters, and read what a killed node of the same name left."""
         self._name, self._output_types = name, (*message_types(process_row(name).produces), Notice)
         super().__init__(name)
+        lower_priority(process_row(name).niceness)  # after DDS has started its threads
 
     def declare_own_parameters(self) -> None:
         """Declare the parameters of all processes.
@@ -91,7 +92,6 @@ class ProcessNode(ParticipantNode):
 
         :raises HmtSlamError: where the node cannot start.
         """
-        lower_priority(process_row(self._name).niceness)
         self.enter_startup_states()
         has_ended = False
         try:
