@@ -72,7 +72,7 @@ def record_drive(log: str, seconds: float) -> tuple[NDArray[np.float64], dict[st
         listener = stack.enter_context(Listener())
         pids = {name: stack.enter_context(listener.running(name, {})).pid for name in process_names()}
         listener.node.create_subscription(String, DOCUMENTS[ClosureDecision], add_decision, topics.CHAIN)
-        with sampled(pids) as samples:
+        with record_samples(pids) as samples:
             play_log(listener, log, seconds, SCAN)
     table = np.array(samples)
     shares = np.diff(table[:, 1:], axis=0) / np.diff(table[:, 0])[:, None]
@@ -80,7 +80,7 @@ def record_drive(log: str, seconds: float) -> tuple[NDArray[np.float64], dict[st
 
 
 @contextmanager
-def sampled(pids: Mapping[str, int]) -> Iterator[list[list[float]]]:
+def record_samples(pids: Mapping[str, int]) -> Iterator[list[list[float]]]:
     """Samples of the time, and of the time that the main thread of each process was on a core, s."""
     samples: list[list[float]] = []
     ended = threading.Event()

@@ -8,11 +8,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from benchmark.timeline import draw_timeline, sampled
+from benchmark.timeline import draw_timeline, record_samples
 
 
 def test_a_process_that_computes_is_on_a_core_and_one_that_sleeps_is_not():
-    with sampled({"own": os.getpid()}) as samples:
+    with record_samples({"own": os.getpid()}) as samples:
         while not samples:
             time.sleep(0.01)
         begin = time.thread_time()
@@ -20,7 +20,7 @@ def test_a_process_that_computes_is_on_a_core_and_one_that_sleeps_is_not():
             pass
     own = np.array(samples)[:, 1]
     assert 0.2 < np.ptp(own) < 0.5
-    with sampled({"own": os.getpid()}) as samples:
+    with record_samples({"own": os.getpid()}) as samples:
         time.sleep(0.3)
     assert np.ptp(np.array(samples)[:, 1]) < 0.1
 
