@@ -213,7 +213,7 @@ def test_a_run_that_is_stopped_while_llvm_loads_a_kernel_ends_in_good_order(
     """What is raised in a function that LLVM calls is lost, and the kernel with it: a crash, or a run that goes on."""
     assert hmt_slam("map", BAG, "--out", tmp_path / "out", "--duration", 4).returncode == 0
     shutil.rmtree(tmp_path / "out")
-    arguments = ["map", str(BAG), "--out", str(tmp_path / "out"), "--duration", "4"]
+    arguments = ["map", str(BAG), "--out", str(tmp_path / "out"), "--duration", "4", "--jobs", "1"]
     code = STOPPED_WHILE_KERNELS_ARE_LOADED.format(number=int(number), arguments=arguments)
     command = [sys.executable, "-c", code]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120.0, check=False)

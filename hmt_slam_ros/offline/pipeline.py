@@ -30,6 +30,9 @@ from hmt_slam_ros.results.hmt_map import RunState
 TOPOLOGY = ("aam", "tsbi", "tlca")
 """The processes in the second OS process."""
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
+"""Signals with a handler of the command line."""
+
 _END_TIMEOUT = 10.0
 """Time for the second OS process to end, s."""
 
@@ -172,8 +175,11 @@ class TopologyWorker:
         context = multiprocessing.get_context("fork")
         self._connection, remote = context.Pipe()
         self._process = context.Process(target=_serve, args=(remote, self._connection, processes), daemon=True)
+        # What a signal raises in a hook that Python calls at a fork is lost.
+        signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
         self._process.start()
         remote.close()
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
 
     def send(self, messages: list[Message]) -> None:
         """Let the processes handle messages; :meth:`receive` has to follow."""
@@ -227,6 +233,7 @@ def _serve(connection: Connection, parent_end: Connection, processes: Mapping[st
     parent_end.close()
     # The parent decides what an interrupt means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
     lock_step = LockStep(processes)
     while True:
         try:
