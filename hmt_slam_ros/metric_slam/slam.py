@@ -241,7 +241,7 @@ class MetricSlam:
             notices = self.enqueue(message)
             return notices if self.is_interrupted else notices + self.process_queue()
         self._look_ahead = None  # whose map changes
-        # A killed process had done so before it sent what this answers.
+        # A slam that handles the journal of a killed one reaches the event of an answer only here.
         answers = self.finish_queue() if self.is_interrupted else []
         return answers + self._handle_answer_or_request(message)
 
