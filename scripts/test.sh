@@ -13,6 +13,15 @@ check() {
     "$venv/bin/python" -m "$@" || status=1
 }
 
+# One worker for the tests of nodes, which often wait, and two for those that only compute (test/conftest.py). Nodes have
+# to react within a time that the other workers may take from them: what fails has to pass alone.
+test_all() {
+    echo "== pytest -n 3"
+    "$venv/bin/python" -m pytest --cache-clear -n 3 --max-worker-restart 2 && return
+    echo "the tests above that failed beside others run once more, alone"
+    check pytest --last-failed --last-failed-no-failures none
+}
+
 # What each worker would otherwise compile at the same time: kernels, and the tests with pytest's assertions.
 compile_all() {
     "$venv/bin/hmt_slam" compile >/dev/null 2>&1
@@ -42,8 +51,10 @@ fi
 
 # Misspelled message fields and wrong types fail; nodes of other machines on the network are not seen.
 export ROS_PYTHON_CHECK_FIELDS=1 ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
-# One worker for the tests of nodes, which often wait, and two for those that only compute (test/conftest.py).
-[ "$#" != 0 ] || set_of_all=(-n 3)
-check pytest ${set_of_all[@]+"${set_of_all[@]}"} "$@"
-[ "$#" != 0 ] || check benchmark short
+if [ "$#" != 0 ]; then
+    check pytest "$@"
+else
+    test_all
+    check benchmark short
+fi
 exit "$status"

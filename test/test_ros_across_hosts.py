@@ -15,6 +15,7 @@ pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, 
 
 PROCESSES = process_names()
 SCANS = 60
+PATIENCE = 400.0  # s
 DECIDED = ("scans.bin", "chain.bin", "tlca.bin")
 """Files of a map with what all processes sent and decided."""
 
@@ -38,7 +39,8 @@ def test_the_map_is_that_of_one_host(link, domain, start, tmp_path):
         str(domain),
         str(SCANS),
     ]
-    with subprocess.Popen(listen, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as listener:
+    listener = subprocess.Popen(listen, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
         assert listener.stdout.readline() == "listens\n"
         for name in PROCESSES:
             start(name, before=link.host_command(1), save_to=saved)
@@ -50,7 +52,9 @@ def test_the_map_is_that_of_one_host(link, domain, start, tmp_path):
             robot__odometry_listeners=2,
             robot__discovery_timeout=60.0,
         )
-        print(listener.communicate()[0])  # shown where the test fails
+        print(listener.communicate(timeout=PATIENCE)[0])  # shown where the test fails
+    finally:
+        listener.kill()
     assert listener.returncode == 0
     for file in DECIDED:
         assert (saved / file).read_bytes() == (out / "hmt_map" / file).read_bytes(), file
