@@ -38,7 +38,7 @@ from hmt_slam_ros.evaluation import (
 )
 from hmt_slam_ros.simulation import open_simulated
 
-COMPARED = ("edmonton", CAMPUS, "aces")
+COMPARED = ("edmonton", CAMPUS, "aces", "intel")
 
 PARTICLES = (12, 100)
 """Numbers of particles of the metric filter, which are tried in this order until it is as accurate."""
@@ -60,11 +60,11 @@ POLICY = (
     "are lower bounds. One run at a time, each an OS process, with compiled kernels. CPU time is user and system time "
     "of the process without reading or simulating the log; peak memory is the largest resident set, which includes the "
     "memory before the first scan. Both runs end with the same refinement of the trajectory, which is listed, and part "
-    f"of both figures. The campus is {CAMPUS_WORLD}, scored by the truth; ACES by its relations; Edmonton, which has "
-    "no truth, by the distance of its relations from those of GMapping, which is a metric RBPF as well."
+    f"of both figures. The campus is {CAMPUS_WORLD}, scored by the truth; ACES and Intel by their relations; Edmonton, "
+    "which has no truth, by the distance of its relations from those of GMapping, which is a metric RBPF as well."
 )
 
-EXTENTS = {"edmonton": 100.0, CAMPUS: 200.0, "aces": 80.0}
+EXTENTS = {"edmonton": 100.0, CAMPUS: 200.0, "aces": 80.0, "intel": 60.0}
 """Half of the side of a map that contains the whole log, m."""
 
 _GMAPPING = "edmonton.gmapping.txt.xz"

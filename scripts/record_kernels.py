@@ -78,7 +78,8 @@ def record_commands(folder: Path, calls: Calls) -> None:
         arguments = [word.format(out=out) for word in words]
         if name == "map":
             out = out if "--from" in arguments else folder / f"out{number}"
-            arguments += ["--out", str(out if "--from" not in arguments else folder / "further")]
+            # With two jobs copies of metric SLAM work ahead, and would record in its place.
+            arguments += ["--jobs", "1", "--out", str(out if "--from" not in arguments else folder / "further")]
         record_program(folder, calls, "command", name, *arguments)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from benchmark.lattice import FIRST_KEYFRAME, PER_AREA, SPACING, Lattice, LatticeScans, make_stops, scan_at
 from benchmark.report import VALIDATION, document_marks
-from benchmark.scale import Cut, cost_of_scans, cut_requirement, growth_requirement, measured_cuts
+from benchmark.scale import ALL, Cut, cost_of_scans, cut_requirement, growth_requirement, measured_cuts
 from benchmark.scale_events import event_requirements, event_table, time_events
 from benchmark.scale_maps import state_of, time_saving, weigh_areas
 from hmt_slam_ros.configuration import Configuration
@@ -80,6 +80,8 @@ def test_the_longest_cut_and_the_growth_of_a_scans_cost_are_scored():
     scans = {10: {"slam": 1.0, "rtl": 1.0}, 1000: {"slam": 1.09, "rtl": 1.2}}
     assert growth_requirement("slam", scans).is_met
     assert not growth_requirement("rtl", scans).is_met
+    assert growth_requirement(ALL, scans).value == pytest.approx(0.145)
+    assert not growth_requirement(ALL, scans).is_met
 
 
 @pytest.mark.parametrize("kind", ["scale"])

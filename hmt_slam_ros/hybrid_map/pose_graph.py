@@ -22,6 +22,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
+from hmt_slam_ros.hybrid_map.sparse_inverse import inverse_blocks
 
 _SMALL_ANGLE = 1e-4
 """Angle below which the logarithm takes its series, rad."""
@@ -43,9 +44,6 @@ _MIN_DAMPING = 1e-6
 
 _MAX_DAMPING = 1e8
 """Damping above which the solver gives up."""
-
-_MARGINAL_COLUMNS = 96
-"""Right-hand sides solved at once for the marginals; with many more, threads of the BLAS wait for each other."""
 
 _REFERENCE_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])
 """Covariance of the reference area, which defines the frame, so that it is regular: 0.1 mm and 0.006 degrees."""
@@ -231,8 +229,7 @@ def optimize(
 ) -> Solution:
     """The most likely poses of a pose graph.
 
-    A step costs one sparse factorization. Marginals cost a solution of the factored system for each of 3 n columns:
-    milliseconds for hundreds of nodes, seconds for a few thousand.
+    A step costs one sparse factorization, and so do the marginals.
 
     :param initial: shape (n, 3), poses to start from; that of ``fixed`` stays.
     :param edges: at least enough to join every node with the fixed one.
@@ -347,17 +344,9 @@ class _System:
         covariances = np.zeros((self._nodes, 3, 3))
         if not self._free.size:
             return covariances
-        factor, size = self._factor(state, 0.0), 3 * self._free.size
-        blocks = np.empty((size, 3))
-        for start in range(0, size, _MARGINAL_COLUMNS):
-            columns = np.arange(start, min(start + _MARGINAL_COLUMNS, size))
-            unit = np.zeros((size, columns.size))
-            unit[columns, columns - start] = 1.0
-            solved = factor.solve(unit)
-            rows = columns // 3 * 3 + np.arange(3)[:, None]
-            blocks[columns] = solved[rows, columns - start].T
-        covariances[self._free] = blocks.reshape(-1, 3, 3)
-        return 0.5 * (covariances + covariances.transpose(0, 2, 1))
+        factor = self._factor(state, 0.0)
+        covariances[self._free] = inverse_blocks(self._pattern.indices, self._pattern.starts, factor, 3)
+        return covariances
 
     def joint_covariance(self, state: _State, nodes: Int64) -> Float64:
         """The joint covariance of some nodes, ascending, shape (3 k, 3 k); zero for the fixed node."""
