@@ -211,9 +211,15 @@ def log(pose: ArrayLike) -> Float64:
 
 def _log_single(x: float, y: float, angle: float) -> Float64:
     omega = wrap_angle(angle)
+    return np.array((*log_shift(x, y, omega), omega))
+
+
+@register_jitable
+def log_shift(x: float, y: float, omega: float) -> tuple[float, float]:
+    """The translation of :func:`log`, for kernels; ``omega`` in [-pi, pi), rad."""
     half = 0.5 * omega
     half_cot = 1.0 - omega**2 / 12.0 if abs(omega) < _SMALL_ANGLE else half / math.tan(half)
-    return np.array((half_cot * x + half * y, -half * x + half_cot * y, omega))
+    return half_cot * x + half * y, -half * x + half_cot * y
 
 
 def adjoint(pose: ArrayLike) -> Float64:

@@ -91,6 +91,7 @@ class Inertia:
         largest = self._acceleration * _TIME_CONSTANTS**2
         self._prior_information = np.linalg.inv(largest)
         self.state = state or InertiaState(np.zeros(3), largest, self._prior_information)
+        self._last_forecast: tuple[InertiaState, float, tuple[RelativeMotion, InertiaState]] | None = None
 
     def predict(self, seconds: float) -> RelativeMotion:
         """The motion of the next ``seconds`` since the last scan."""
@@ -98,7 +99,13 @@ class Inertia:
         return motion
 
     def forecast(self, seconds: float) -> tuple[RelativeMotion, InertiaState]:
-        """The motion of the next ``seconds`` since the last scan, and the state with it."""
+        """The motion of the next ``seconds`` since the last scan, and the state with it; kept for the next call."""
+        last = self._last_forecast
+        if last is None or last[0] is not self.state or last[1] != seconds:
+            last = self._last_forecast = self.state, seconds, self._forecast(seconds)
+        return last[2]
+
+    def _forecast(self, seconds: float) -> tuple[RelativeMotion, InertiaState]:
         state = self.state
         long_term = _moving_mean(state.long_term_period, seconds, _LONG_TERM_WEIGHT)
         is_regular = long_term / _IRREGULAR < seconds < long_term * _IRREGULAR
@@ -169,7 +176,7 @@ class OdometryNoise:
 
     They are squared differences between odometry and match over the last steps, relative to what the model expects.
 
-    :ivar state: the sums over the last steps.
+    :ivar factors: on the deviations of translation and of rotation, shape (2,).
     """
 
     def __init__(self, state: OdometryNoiseState | None = None) -> None:
@@ -177,19 +184,19 @@ class OdometryNoise:
         self.state = state or OdometryNoiseState()
 
     @property
-    def factors(self) -> Float64:
-        """Factors on the deviations of translation and of rotation, shape (2,)."""
-        return np.sqrt(np.maximum(1.0, self.state.weighted_ratios / self.state.weights))
+    def state(self) -> OdometryNoiseState:
+        """The sums over the last steps."""
+        return self._state
 
-    @property
-    def _variance_factors(self) -> Float64:
-        """Factors on a covariance, shape (3, 3)."""
-        scale = self.factors[[0, 0, 1]]
-        return np.outer(scale, scale)
+    @state.setter
+    def state(self, state: OdometryNoiseState) -> None:
+        self._state, self.factors = state, np.sqrt(np.maximum(1.0, state.weighted_ratios / state.weights))
+        self._variance_factors = _variance_factors(self.factors)
+        self._lasting_factors = _variance_factors(np.minimum(self.factors, NOISY_FACTOR))
 
     def scale(self, odometry: RelativeMotion) -> RelativeMotion:
         """A step with the measured noise, from one with the model's covariance."""
-        return odometry._replace(covariance=odometry.covariance * self._variance_factors)
+        return RelativeMotion(odometry.increment, odometry.covariance * self._variance_factors)
 
     def fuse(self, odometry: RelativeMotion, interpolation: Float64, inertia: RelativeMotion) -> RelativeMotion:
         """The step by odometry and inertia together.
@@ -200,8 +207,7 @@ class OdometryNoise:
         :param odometry: with the model's covariance.
         :param interpolation: covariance of the error of interpolation, shape (3, 3).
         """
-        limited = np.minimum(self.factors, NOISY_FACTOR)[[0, 0, 1]]
-        lasting = odometry.covariance * np.outer(limited, limited)
+        lasting = odometry.covariance * self._lasting_factors
         independent = odometry.covariance * self._variance_factors - lasting + interpolation
         if not independent.any():
             return odometry._replace(covariance=lasting)
@@ -228,6 +234,12 @@ class OdometryNoise:
             ratios[k] += weight * min(ratio, (_OUTLIER * self.factors[k]) ** 2)
             weights[k] += weight
         self.state = OdometryNoiseState(ratios, weights)
+
+
+def _variance_factors(factors: Float64) -> Float64:
+    """Factors on a covariance, shape (3, 3), from those on the deviations of translation and rotation."""
+    scale = factors[[0, 0, 1]]
+    return np.outer(scale, scale)
 
 
 @dataclass(frozen=True, eq=False)

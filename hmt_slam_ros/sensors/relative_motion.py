@@ -8,9 +8,18 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.metric_slam import FilterParameters, MotionParameters
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, matrix_inverse, propagate_covariance
+from hmt_slam_ros.geometry.gaussian import (
+    chi_square_gate,
+    dot,
+    inverse_pose_covariance,
+    matrix_inverse,
+    propagate_covariance,
+    solve,
+    symmetric_from_array,
+)
 
 _DEGREES, _RADIANS = 180.0 / math.pi, math.pi / 180.0
 
@@ -93,10 +102,18 @@ def path_standard_deviations(distance: Length, angle: Length, motion: MotionPara
     return translation, rotation + motion.rotation_from_rotation * angle
 
 
+@njit(cache=True)
 def is_jump(odometry: RelativeMotion, inertia: RelativeMotion) -> bool:
-    """Whether the robot can hardly have moved as odometry says."""
-    expected = PoseGaussian(inertia.increment, inertia.covariance + _LEAST_VARIANCE * np.eye(3))
-    return PoseGaussian(*odometry).mahalanobis2(expected) > _JUMP_GATE
+    """Whether the robot can hardly have moved as odometry says: as :meth:`PoseGaussian.mahalanobis2`, compiled."""
+    one, other = odometry.increment, inertia.increment
+    dx, dy, turn = other[0] - one[0], other[1] - one[1], se2.wrap_angle(other[2] - one[2])
+    x, y = se2.rotate_back(np.cos(one[2]), np.sin(one[2]), dx, dy)
+    forward, aside = se2.log_shift(x, y, turn)
+    x, y = se2.rotate_back(np.cos(other[2]), np.sin(other[2]), -dx, -dy)
+    spread = inverse_pose_covariance(odometry.covariance, np.array((x, y, -turn))) + inertia.covariance
+    spread += _LEAST_VARIANCE * np.eye(3)
+    difference = (forward, aside, turn)
+    return bool(dot(difference, solve(symmetric_from_array(spread), difference)) > _JUMP_GATE)
 
 
 def is_wide(covariance: Float64, settings: FilterParameters) -> bool:

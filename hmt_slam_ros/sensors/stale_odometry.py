@@ -56,23 +56,29 @@ class SteadyMotionSearch:
         return next((self.step_count for pose in poses if self._is_decided_by(pose)), None)
 
     def _is_decided_by(self, pose: Float64) -> bool:
-        step, self._last = se2.log(se2.between(self._last, pose)), pose
         motion = se2.log(se2.between(self._start, pose))
-        self._motions[self.step_count], self._variances[self.step_count] = motion, np.diag(self._noise(motion))
+        noise = self._noise(motion)
+        self._motions[self.step_count], self._variances[self.step_count] = motion, noise.diagonal()
+        last, self._last = self._last, pose
         self.step_count += 1
+        if self.step_count == 1:
+            return self._cost(motion, self._expected.covariance, noise) <= self._fault
+        step = se2.log(se2.between(last, pose))
         # Velocities walk at random: after n steps by n times the variance of a change, on average by a third of that.
         walked = (self.step_count - 1) * self._change
-        contradicts = self._cost(step, walked) > self._fault
-        if self.step_count == 1:
-            return not contradicts
+        if self._cost(step, self._expected.covariance + walked, self._noise(step)) <= self._fault:
+            return False
         steady = motion / self.step_count
-        return contradicts and self._cost(steady, walked / 3.0) + self._lag_cost(steady) <= self._fault
+        cost = self._cost(steady, self._expected.covariance + walked / 3.0, self._noise(steady))
+        return cost + self._lag_cost(steady) <= self._fault
 
-    def _cost(self, step: Float64, walked: Float64) -> float:
-        """The cost of a step, a twist (3,), against the velocity before."""
+    def _cost(self, step: Float64, expected: Float64, noise: Float64) -> float:
+        """The cost of a step, a twist (3,), against the velocity before.
+
+        :param expected: covariance (3, 3) of the motion by that velocity; ``noise``, of odometry over the step.
+        """
         difference = step - self._velocity
-        information = matrix_inverse(self._expected.covariance + walked + self._noise(step))
-        return 0.5 * float(difference @ information @ difference)
+        return 0.5 * float(difference @ matrix_inverse(expected + noise) @ difference)
 
     def _lag_cost(self, step: Float64) -> float:
         """The cost of motions that should lie between none and the steady one, as readings that lag."""
