@@ -1,4 +1,4 @@
-"""Scans and odometry on their way into metric SLAM: the queue of scans, and notices of faults, once for each."""
+"""Scans and odometry on their way into metric SLAM: the queue of scans, their motion, and notices of faults."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 from itertools import takewhile
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.messages import Message, Notice
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.motion_model import NOISY_FACTOR, OdometryNoise
+from hmt_slam_ros.sensors.motion_model import NOISY_FACTOR, MotionModel, MotionState, OdometryNoise, Prediction
 from hmt_slam_ros.sensors.odometry import OdometryBuffer
 from hmt_slam_ros.sensors.relative_motion import NO_MOTION, RelativeMotion
 from hmt_slam_ros.sensors.scan import SweepCheck, SweepState
@@ -76,20 +77,6 @@ class ScanQueue:
     def state(self) -> ScanQueueState:
         """The whole state, as a value."""
         return replace(self._state, scans=tuple(self._scans), sweeps=self._sweeps.state)
-
-    def empty_copy(self, odometry: OdometryBuffer) -> ScanQueue:
-        """An empty queue, for scans of any other time, which reports no fault again.
-
-        :param odometry: the readings for which scans wait.
-        """
-        return ScanQueue(self._max_waiting, odometry, ScanQueueState(reported_faults=self._state.reported_faults))
-
-    def copy(self, odometry: OdometryBuffer) -> ScanQueue:
-        """A copy in the same state.
-
-        :param odometry: the readings for which its scans wait.
-        """
-        return ScanQueue(self._max_waiting, odometry, self.state)
 
     @property
     def waits_for_odometry(self) -> bool:
@@ -305,6 +292,78 @@ class OdometryMonitor:
             "in heading as the noise model of odometry expects, so it is trusted less: raise "
             "motion.rotation_from_rotation and its neighbors if it stays so."
         )
+
+
+class Intake:
+    """Scans and odometry on their way into the filters.
+
+    :ivar motion: the motion between scans.
+    :ivar queue: the scans that wait.
+    """
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        motion: MotionState,
+        odometry_monitor: OdometryMonitorState,
+        scan_queue: ScanQueueState,
+    ) -> None:
+        """:param motion: to go on from, as the other two."""
+        self._configuration = configuration
+        self.motion = MotionModel(configuration.motion, motion)
+        self._monitor = OdometryMonitor(odometry_monitor)
+        most = configuration.filter.max_scans_waiting_for_odometry
+        self.queue = ScanQueue(most, self.motion.odometry, scan_queue)
+
+    @property
+    def state(self) -> tuple[MotionState, OdometryMonitorState, ScanQueueState]:
+        """The whole state, as values."""
+        return self.motion.state, self._monitor.state, self.queue.state
+
+    def copy(self) -> Intake:
+        """A copy in the same state."""
+        return Intake(self._configuration, *self.state)
+
+    def restart(self) -> Intake:
+        """Without measurements, for those of any other time; reports no fault of scans again."""
+        faults = ScanQueueState(reported_faults=self.queue.state.reported_faults)
+        return Intake(self._configuration, MotionState(), OdometryMonitorState(), faults)
+
+    def add(self, measurement: Odometry | Scan) -> list[Message]:
+        """Add a measurement; returns notices of its faults."""
+        if isinstance(measurement, Scan):
+            return self.queue.add_scan(measurement)
+        self.queue.add_odometry(measurement)
+        return []
+
+    def take(self, *, ended: bool) -> tuple[Scan, list[Message]] | None:
+        """The next scan, which is ready, and notices of its odometry; None as long as it may be stale.
+
+        :param ended: whether the odometry has ended.
+        """
+        stamp = self.queue.next_scan.stamp
+        stale = self.motion.settle_odometry(stamp)
+        if stale is None and not ended:
+            return None
+        notices = _slam_notices(self._monitor.add_stale_odometry(stamp, stale)) if stale else []
+        return self.queue.pop(), notices
+
+    def observe(self, stamp: int, prediction: Prediction, tracked: TrackedMotion) -> list[Message]:
+        """Learn from the motion of a scan that was matched; returns notices of odometry that contradicts it."""
+        self.motion.observe(tracked.increment, tracked.information, tracked.contradicts_odometry)
+        return _slam_notices(self._monitor.add_scan(stamp, prediction.odometry, tracked))
+
+    def check_noise(self) -> list[Message]:
+        """The notice of noisy odometry, once."""
+        return _slam_notices(self._monitor.check_noise(self.motion.noise))
+
+    def end(self) -> list[Message]:
+        """The notice of a disagreement that lasts to the end."""
+        return _slam_notices(self._monitor.end_disagreement())
+
+
+def _slam_notices(text: str | None) -> list[Message]:
+    return [] if text is None else [Notice("slam", text)]
 
 
 def _since_text(unreported: int) -> str:

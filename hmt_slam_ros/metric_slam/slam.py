@@ -40,16 +40,15 @@ from hmt_slam_ros.messages.messages import (
     LocalEstimate,
     Message,
     MotionCondition,
-    Notice,
     PoseReset,
     TrackingReset,
 )
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
-from hmt_slam_ros.metric_slam.intake import OdometryMonitor, OdometryMonitorState, ScanQueue, ScanQueueState
+from hmt_slam_ros.metric_slam.intake import Intake, OdometryMonitorState, ScanQueueState
 from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis, LiveHypothesisState
 from hmt_slam_ros.metric_slam.look_ahead import LookAhead
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.motion_model import MotionModel, MotionState, Prediction
+from hmt_slam_ros.sensors.motion_model import MotionState, Prediction
 from hmt_slam_ros.sensors.odometry import deskew_scan
 from hmt_slam_ros.sensors.relative_motion import is_wide
 from hmt_slam_ros.submap.local_filter import FilterFactory, PlacedKeyframe
@@ -126,13 +125,9 @@ class MetricSlam:
         self._filters = filters(self._mapping)
         self._neighborhood = Neighborhood(MAX_AREA_SIGMA, MAX_KEYFRAME_DISTANCE)
         self._replica = Replica.from_state(state.replica)
-        self._motion = MotionModel(configuration.motion, state.motion)
-        self._odometry_monitor = OdometryMonitor(state.odometry_monitor)
-        self._scan_queue = ScanQueue(
-            configuration.filter.max_scans_waiting_for_odometry, self._motion.odometry, state.scan_queue
-        )
+        self._intake = Intake(configuration, state.motion, state.odometry_monitor, state.scan_queue)
         self._live_hypotheses = self._restored_hypotheses(state)
-        # All but the six parts above, which change in place.
+        # All but these parts, which change in place.
         self._state = replace(
             state,
             replica=ReplicaState(),
@@ -165,12 +160,13 @@ class MetricSlam:
     def state(self) -> SlamState:
         """The whole state, as a value."""
         live, patches = self._hypothesis_states()
+        motion, odometry_monitor, scan_queue = self._intake.state
         return replace(
             self._state,
             replica=self._replica.state,
-            motion=self._motion.state,
-            odometry_monitor=self._odometry_monitor.state,
-            scan_queue=self._scan_queue.state,
+            motion=motion,
+            odometry_monitor=odometry_monitor,
+            scan_queue=scan_queue,
             patches=patches,
             live_hypotheses=live,
         )
@@ -219,7 +215,7 @@ class MetricSlam:
     @property
     def queued_scans(self) -> int:
         """Number of scans in the queue."""
-        return len(self._scan_queue)
+        return len(self._intake.queue)
 
     @property
     def peak_map_bytes(self) -> int:
@@ -262,12 +258,9 @@ class MetricSlam:
 
     def enqueue(self, measurement: Odometry | Scan) -> list[Message]:
         """Add a measurement; returns notices of its faults."""
-        if isinstance(measurement, Scan):
-            return self._scan_queue.add_scan(measurement)
-        self._scan_queue.add_odometry(measurement)
-        if self._look_ahead is not None:
+        if isinstance(measurement, Odometry) and self._look_ahead is not None:
             self._look_ahead.add_odometry(measurement)
-        return []
+        return self._intake.add(measurement)
 
     def look_ahead(self) -> list[EarlyEstimate]:
         """Estimates of the scans that wait, as far as they have none yet.
@@ -277,14 +270,14 @@ class MetricSlam:
         """
         if self._state.reset_pending:
             return []
-        scans = self._scan_queue.ready_scans()
+        scans = self._intake.queue.ready_scans()
         if not scans or self._state.processed_scans + len(scans) <= self._next_early:
             return []
         ahead = self._look_ahead or LookAhead(
             self._configuration,
             self._mapping,
             self._best_hypothesis,
-            self._motion.state,
+            self._intake.motion.state,
             self._state.keyframe_events - 1,
             self._next_early,
         )
@@ -299,9 +292,7 @@ class MetricSlam:
         """
         other = MetricSlam.__new__(MetricSlam)
         vars(other).update(vars(self), _is_fork=True, _look_ahead=None)
-        other._motion = MotionModel(self._configuration.motion, self._motion.state)
-        other._odometry_monitor = OdometryMonitor(self._odometry_monitor.state)
-        other._scan_queue = self._scan_queue.copy(other._motion.odometry)
+        other._intake = self._intake.copy()
         other._live_hypotheses = {name: live.branch(name) for name, live in self._live_hypotheses.items()}
         return other
 
@@ -341,12 +332,7 @@ class MetricSlam:
         """
         self._replica.apply_decision(decision)
         self.release()
-        self._motion, self._odometry_monitor, self._scan_queue = (
-            other._motion,
-            other._odometry_monitor,
-            other._scan_queue,
-        )
-        self._live_hypotheses, self._state = other._live_hypotheses, other._state
+        self._intake, self._live_hypotheses, self._state = other._intake, other._live_hypotheses, other._state
         self.is_interrupted = other.is_interrupted
 
     def add_to_replica(self, keyframe: Keyframe) -> None:
@@ -369,36 +355,34 @@ class MetricSlam:
         """Process a batch of the scans that are ready, up to the next keyframe event; returns their messages."""
         answers: list[Message] = []
         left, self.is_interrupted = self.batch_size, False
-        while not self._state.awaiting_decision and self._scan_queue.is_ready(ended=self._ended):
+        while not self._state.awaiting_decision and self._intake.queue.is_ready(ended=self._ended):
             # Without odometry at once, before a reading lets them wait again.
-            if left == 0 and self._scan_queue.waits_for_odometry:
+            if left == 0 and self._intake.queue.waits_for_odometry:
                 self.is_interrupted = True
                 break
-            scan = self._scan_queue.next_scan
-            stale = self._motion.settle_odometry(scan.stamp)
-            if stale is None and not self._ended:
+            taken = self._intake.take(ended=self._ended)
+            if taken is None:
                 break
-            if stale:
-                answers += self._notices(self._odometry_monitor.add_stale_odometry(scan.stamp, stale))
-            answers += self._process_scan(self._scan_queue.pop())
+            scan, notices = taken
+            answers += notices + self._process_scan(scan)
             left = left and left - 1
-        if self._ended and not self._scan_queue and not self._state.awaiting_decision:
+        if self._ended and not self._intake.queue and not self._state.awaiting_decision:
             answers += self._finish()
         return answers
 
     def _reset_tracking(self) -> list[Message]:
         """Restart tracking at the next scan; scans that still wait are dropped, as they are from before."""
-        self._motion, self._odometry_monitor = MotionModel(self._configuration.motion), OdometryMonitor()
         self._next_early = 0
-        dropped = self._state.dropped_scans + len(self._scan_queue)
-        self._scan_queue = self._scan_queue.empty_copy(self._motion.odometry)
+        dropped = self._state.dropped_scans + len(self._intake.queue)
+        self._intake = self._intake.restart()
         self._state = replace(self._state, dropped_scans=dropped, reset_pending=True, motion_condition="ordinary")
         return [TrackingReset(self._state.keyframe_events, self._state.processed_scans)]
 
     def _process_scan(self, scan: Scan) -> list[Message]:
         self._look_ahead = None  # whose filter goes on
-        prediction = self._motion.predict(scan.stamp)
-        prepared = PreparedScan(self._mapping, deskew_scan(scan, self._motion.odometry, self._configuration.rtl))
+        motion = self._intake.motion
+        prediction = motion.predict(scan.stamp)
+        prepared = PreparedScan(self._mapping, deskew_scan(scan, motion.odometry, self._configuration.rtl))
         messages: list[Message] = []
         if self._state.reset_pending:
             self._reset_filters(prediction)
@@ -430,11 +414,10 @@ class MetricSlam:
             hypothesis: live.filter.track(prepared, prediction) for hypothesis, live in self._live_hypotheses.items()
         }
         best = tracked[self._replica.best_hypothesis]
-        self._motion.observe(best.increment, best.information, best.contradicts_odometry)
         path_length = self._state.path_length + math.hypot(best.increment[0], best.increment[1])
         condition = self._motion_condition(prediction, contradicted=best.contradicts_odometry)
         self._state = replace(self._state, path_length=path_length, motion_condition=condition)
-        return self._notices(self._odometry_monitor.add_scan(prepared.scan.stamp, prediction.odometry, best))
+        return self._intake.observe(prepared.scan.stamp, prediction, best)
 
     def _motion_condition(self, prediction: Prediction, *, contradicted: bool) -> MotionCondition:
         """The condition of the motion since the last keyframe event, with one more scan.
@@ -446,10 +429,6 @@ class MetricSlam:
         if contradicted or is_wide(self._best_hypothesis.filter.tracking_covariance, self._configuration.filter):
             return "uncertain"
         return self._state.motion_condition
-
-    @staticmethod
-    def _notices(text: str | None) -> list[Message]:
-        return [] if text is None else [Notice("slam", text)]
 
     def _keyframe_event(self, prepared: PreparedScan) -> list[Message]:
         sequence, scan = self._state.keyframe_events, prepared.scan
@@ -467,7 +446,7 @@ class MetricSlam:
             for live in self._live_hypotheses.values()
         )
         last = self._best_hypothesis.event
-        self._motion.observe_keyframe(last.motion, last.match_information)
+        self._intake.motion.observe_keyframe(last.motion, last.match_information)
         after_reset, initial_pose = self._state.reset_pending, self._state.initial_pose
         keyframe = Keyframe(
             sequence,
@@ -491,7 +470,7 @@ class MetricSlam:
             initial_pose=initial_pose if after_reset else None,
             motion_condition="ordinary",
         )
-        return [*scan_poses, keyframe, *self._notices(self._odometry_monitor.check_noise(self._motion.noise))]
+        return [*scan_poses, keyframe, *self._intake.check_noise()]
 
     @property
     def _is_lifelong(self) -> bool:
@@ -528,7 +507,7 @@ class MetricSlam:
             state.processed_scans - 1,
             best.filter.area,
             best.pose_belief(),
-            self._motion.odometry_pose,
+            self._intake.motion.odometry_pose,
             state.dropped_scans,
         )
 
@@ -597,7 +576,7 @@ class MetricSlam:
         self._ended = False
         processed, dropped = self._state.processed_scans, self._state.dropped_scans
         finished = EndOfRun(processed + dropped, processed, dropped)
-        return [*self._take_scan_poses(), *self._notices(self._odometry_monitor.end_disagreement()), finished]
+        return [*self._take_scan_poses(), *self._intake.end(), finished]
 
 
 def _changes_filter(hypothesis: Hypothesis) -> bool:
