@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import multiprocessing
+import os
 import sys
 import time
 
@@ -12,8 +14,11 @@ from hmt_slam_ros.kernel_table import known_calls
 
 
 def run_compile(_options: argparse.Namespace) -> None:
-    """Compile what is not cached, with the time left, and say so."""
+    """Compile what is not cached, on two cores where there are, with the time left, and say so."""
     begin, loading = time.monotonic(), KernelLoading()
+    helper = multiprocessing.get_context("fork").Process(target=KernelLoading().run, daemon=True)
+    if len(os.sched_getaffinity(0)) > 1:
+        helper.start()
     with MovingLine(sys.stderr) as line:
         loading.run(lambda: line.show(loading.progress))
     print(f"{len(known_calls())} kernels are compiled; {time.monotonic() - begin:.1f} s")
