@@ -35,69 +35,116 @@ def mapped_world(tmp_path_factory):
     return world, out
 
 
+class PilotedRobot:
+    """The pilot, the five processes and a robot in a mapped world, and what they publish."""
+
+    def __init__(self, mapped_world, listener, start):
+        self.world, self._out = mapped_world
+        self._listener, self._start = listener, start
+        # Slam alone would not look for the robot before it is there.
+        self._shared = {"start_from": self._out, "mode": "localization", "tsbi__recheck_keyframes": 100}
+        self.outcomes = listener.subscribe(String, "pilot/task_result", topics.LATCHED)
+        self.starts = listener.subscribe(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
+        self.goals = listener.subscribe(PoseStamped, GOAL_POSE, topics.STREAM)
+        self._places = listener.subscribe(String, PLACE, topics.LATCHED)
+        self._truths = listener.subscribe(PoseStamped, "ground_truth", topics.STREAM)
+        self._localized = listener.subscribe(Bool, IS_LOCALIZED, topics.LATCHED)
+        self._reports = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+        self._tasks = listener.node.create_publisher(String, "pilot/task", topics.STREAM)
+        self._alive = [start(name, **self._shared) for name in PROCESSES]
+        self.pilot = start("pilot", **self._shared)
+        self.until(lambda: self._tasks.get_subscription_count() == 1)
+
+    def until(self, condition):
+        self._listener.until(condition, alive=[self.pilot, *self._alive])
+
+    def give(self, task):
+        self._tasks.publish(String(data=task))
+
+    def start_robot(self):
+        robot = self._start(
+            "robot",
+            log=self.world,
+            robot__drive="commands",
+            robot__rate=4.0,
+            robot__start=in_hallway(self.world, 9.0),
+            robot__scan_listeners=2,
+            robot__odometry_listeners=3,
+            robot__discovery_timeout=60.0,
+        )
+        self._alive.append(robot)
+
+    def restart_pilot(self):
+        os.kill(self.pilot.pid, signal.SIGKILL)
+        self.pilot.wait(10)
+        self.pilot = self._start("pilot", **self._shared)
+
+    @property
+    def place(self):
+        """The last place."""
+        return decode(self._places[-1].data, PlaceEstimate)
+
+    @property
+    def is_localized(self):
+        return self._localized[-1].data
+
+    def messages(self):
+        """All messages in the pilot's diagnostics."""
+        return [v.value for m in self._reports if m.status[0].name == "/pilot" for v in m.status[0].values]
+
+    def truth(self, stamp=None):
+        """The last true pose, or that of a stamp."""
+        found = self._truths[-1] if stamp is None else next(m for m in self._truths if m.header.stamp == stamp)
+        return pose_from_message(found.pose)
+
+    def wait_for_truths(self, count):
+        before = len(self._truths)
+        self.until(lambda: len(self._truths) > before + count)
+
+
 def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped_world, listener, start):
-    world, out = mapped_world
-    # Slam alone would not look for the robot before it is there.
-    shared = {"start_from": out, "mode": "localization", "tsbi__recheck_keyframes": 100}
-    outcomes = listener.subscribe(String, "pilot/task_result", topics.LATCHED)
-    places = listener.subscribe(String, PLACE, topics.LATCHED)
-    starts = listener.subscribe(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
-    goals = listener.subscribe(PoseStamped, GOAL_POSE, topics.STREAM)
-    truths = listener.subscribe(PoseStamped, "ground_truth", topics.STREAM)
-    localized = listener.subscribe(Bool, IS_LOCALIZED, topics.LATCHED)
-    diagnostics = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
-    pilot = start("pilot", **shared)
-    others = [start(name, **shared) for name in PROCESSES]
-    goals_ = listener.node.create_publisher(String, "pilot/task", topics.STREAM)
-    listener.until(lambda: goals_.get_subscription_count() == 1, alive=[pilot])
-    goals_.publish(String(data="go cellar"))
-    goals_.publish(String(data="dance"))
-    listener.until(lambda: outcomes, alive=[pilot])
-    sentence, _, room = outcomes[0].data.rpartition(" from ")
+    run = PilotedRobot(mapped_world, listener, start)
+    run.give("go cellar")
+    run.give("dance")
+    run.until(lambda: run.outcomes)
+    sentence, _, room = run.outcomes[0].data.rpartition(" from ")
     assert sentence == "go cellar: there is no such room: choose"
-    goals_.publish(String(data=f"go {room}"))
-    robot = start(
-        "robot",
-        log=world,
-        robot__drive="commands",
-        robot__rate=4.0,
-        robot__start=in_hallway(world, 9.0),
-        robot__scan_listeners=2,
-        robot__odometry_listeners=3,
-        robot__discovery_timeout=60.0,
-    )
-    listener.until(lambda: len(outcomes) == 2, alive=[pilot, robot, *others])
-    assert outcomes[1].data == f"go {room}: the robot is there"
-    # The map's frame is where the scripted drive began.
-    origin = scripted_drive(world)[1][0]
-    (goal,) = goals
-    assert goal.header.frame_id == "map"
-    place = se2.compose(origin, pose_from_message(goal.pose))
-    # The last keyframe in the room is up to half a meter before the drive's end.
-    np.testing.assert_allclose(place, (ROOM[0], ROOM[1] - 0.25, 0.5 * math.pi), atol=0.25)
-    assert math.dist(pose_from_message(truths[-1].pose)[:2], place[:2]) < 0.2
-    messages = [value.value for m in diagnostics if m.status[0].name == "/pilot" for value in m.status[0].values]
+    run.give(f"go {room}")
+    run.start_robot()
+    run.until(lambda: len(run.outcomes) == 2)
+    assert run.outcomes[1].data == f"go {room}: the robot is there"
     refusal = "pilot/task is left out: 'dance' is no task: give one of localize, stop, or go and the name of a place"
-    assert refusal in messages
-    last = decode(places[-1].data, PlaceEstimate)
-    assert (last.place, last.room, last.confident) == (room.replace("room", "door"), room, True)
-    (begun,) = starts
-    assert begun.header.frame_id == "map"
-    true = next(pose_from_message(m.pose) for m in truths if m.header.stamp == begun.header.stamp)
-    off = se2.between(se2.between(origin, true), pose_from_message(begun.pose.pose))
-    assert np.abs(off).max() < 0.05, off
-    listener.until(lambda: localized[-1].data, alive=others)
+    assert refusal in run.messages()
+    place = run.place
+    assert (place.place, place.room, place.confident) == (room.replace("room", "door"), room, True)
+    # The map's frame is where the scripted drive began.
+    origin = scripted_drive(run.world)[1][0]
+    (goal,) = run.goals
+    assert goal.header.frame_id == "map"
+    there = se2.compose(origin, pose_from_message(goal.pose))
+    # The last keyframe in the room is up to half a meter before the drive's end.
+    np.testing.assert_allclose(there, (ROOM[0], ROOM[1] - 0.25, 0.5 * math.pi), atol=0.25)
+    assert math.dist(run.truth()[:2], there[:2]) < 0.2
+    assert_start(run, origin)
+    run.until(lambda: run.is_localized)
 
     # Killed, it restarts: the robot may be anywhere, and stands.
-    os.kill(pilot.pid, signal.SIGKILL)
-    pilot.wait(10)
-    again = start("pilot", **shared)
-    listener.until(lambda: decode(places[-1].data, PlaceEstimate).place is None, alive=[again, robot, *others])
-    before = len(truths)
-    listener.until(lambda: len(truths) > before + 20, alive=[again, robot, *others])
-    last = decode(places[-1].data, PlaceEstimate)
-    assert (last.place, last.room, last.confident) == (None, None, False)
-    assert np.abs(pose_from_message(truths[-1].pose) - pose_from_message(truths[before].pose)).max() < 1e-9
+    run.restart_pilot()
+    run.until(lambda: run.place.place is None)
+    before = run.truth()
+    run.wait_for_truths(20)
+    place = run.place
+    assert (place.place, place.room, place.confident) == (None, None, False)
+    assert np.abs(run.truth() - before).max() < 1e-9
+
+
+def assert_start(run, origin):
+    """The one initial pose that the pilot gave slam is true."""
+    (begun,) = run.starts
+    assert begun.header.frame_id == "map"
+    true = se2.between(origin, run.truth(begun.header.stamp))
+    off = se2.between(true, pose_from_message(begun.pose.pose))
+    assert np.abs(off).max() < 0.05, off
 
 
 def test_without_a_map_it_ends_with_a_sentence(start):
