@@ -40,6 +40,7 @@ MEASUREMENTS = {
     "sessions": "accuracy of a log mapped in two sessions instead of one",
     "speed": "CPU time, memory, cost of a scan, start of the nodes",
     "live": "latency of the nodes' poses, with a fast laser and in replays at ten times real time",
+    "timeline": "which process computes when, around a loop closure",
     "calibration": "calibration of the probabilities of topological paths",
     "loops": "precision and recall of loop closures",
     "topology": "exactness of the final topology in the world of nested loops",

@@ -166,7 +166,7 @@ def measure_odometry(log: str, seconds: float) -> MessageTimes:
     with _run_nodes() as listener:
         sent = _collect_times(listener, Odometry, ODOM, topics.SENSOR)
         received = _collect_times(listener, PoseWithCovarianceStamped, POSE, topics.STREAM)
-        _play_log(listener, log, seconds, ODOM)
+        play_log(listener, log, seconds, ODOM)
         return MessageTimes(sent, received)
 
 
@@ -188,7 +188,7 @@ def measure_scans(log: str, seconds: float, tsbi: Sequence[str] = ()) -> ScanTim
         final = _collect_estimates(listener, LocalEstimate, record.compare)
         # The first early estimates would be lost otherwise.
         listener.wait_until(lambda: listener.node.count_publishers(DOCUMENTS[EarlyEstimate]) > 0)
-        _play_log(listener, log, seconds, SCAN)
+        play_log(listener, log, seconds, SCAN)
         listener.wait_until(lambda: len(final) >= len(sent), _TIMEOUT)
         first = {stamp: min(moment, early.get(stamp, moment)) for stamp, moment in final.items()}
         return ScanTimes(MessageTimes(sent, first), MessageTimes(sent, final), record)
@@ -236,7 +236,7 @@ def replay_log(log: str, programs: Sequence[str] = PROCESSES) -> ReplayScores:
         started = [stack.enter_context(listener.running(name, {})).pid for name in programs]
         answered_scans = _count_documents(listener, DOCUMENTS[LocalEstimate])
         begin = time.monotonic()
-        status = _play_log(listener, log, 0.0, rate=RATE, flow_control=True)
+        status = play_log(listener, log, 0.0, rate=RATE, flow_control=True)
         seconds = time.monotonic() - begin
         listener.wait_until(lambda: answered_scans() >= status.scans)
         memory = sum(proportional_set_size(process) for pid in started for process in (pid, *_children(pid)))
@@ -295,7 +295,7 @@ def _saturate_cores() -> Iterator[None]:
             burner.wait()
 
 
-def _play_log(
+def play_log(
     listener: Listener,
     log: str,
     seconds: float,
