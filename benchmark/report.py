@@ -7,7 +7,6 @@ import json
 import math
 import os
 import platform
-import shutil
 import subprocess
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from benchmark.logs import ROOT
 from benchmark.runs import PARAMETERS
@@ -248,11 +248,16 @@ def write_between_marks(path: Path, kind: str, text: str) -> None:
     path.write_text(f"{before}{begin}\n{text}\n{end}{after}", encoding="utf-8")
 
 
+_COLORS = 48
+"""Colors of a picture in docs/, which take a third of the bytes."""
+
+
 def copy_illustrations(report: Report, out: Path) -> str:
-    """Copy the illustrations of a report into docs/; return the Markdown that shows them.
+    """Copy the illustrations of a report into docs/, in few colors; return the Markdown that shows them.
 
     :param out: folder of the report.
     """
     for name in report.illustrations:
-        shutil.copy(out / name, IMAGES / name)
+        picture = Image.open(out / name).convert("RGB")
+        picture.quantize(_COLORS, dither=Image.Dither.NONE).save(IMAGES / name, optimize=True)
     return "".join(f"\n\n![{report.pictures[name]}](../images/{name})" for name in report.illustrations)

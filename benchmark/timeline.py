@@ -51,8 +51,8 @@ def measure_timeline(settings: Settings) -> Report:
     report = Report("timeline", "Which process computes when")
     draw_timeline(settings.out / PICTURE, times, shares, [one - closure for one in drive.closures])
     report.pictures[PICTURE] = (
-        f"Share of a core that each node takes, in steps of {1e3 * PERIOD:.0f} ms, around the loop closure of the bundled "
-        f"log at ten scans a second. Dotted: closures are accepted."
+        f"Share of a core that each node takes, in steps of {1e3 * PERIOD:.0f} ms, around the loop closure of the "
+        "bundled log at ten scans a second. Dotted: closures are accepted."
     )
     rows = [[name, f"{100.0 * own.mean():.1f}", f"{100.0 * own.max():.0f}"] for name, own in shares.items()]
     report.body.append(table(["node", "share of a core, mean [%]", "largest [%]"], rows))
