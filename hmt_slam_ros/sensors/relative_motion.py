@@ -12,10 +12,12 @@ from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.metric_slam import FilterParameters, MotionParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import (
+    Symmetric,
+    add_scaled,
     chi_square_gate,
     dot,
-    inverse_pose_covariance,
     matrix_inverse,
+    multiply,
     propagate_covariance,
     solve,
     symmetric_from_array,
@@ -110,10 +112,21 @@ def is_jump(odometry: RelativeMotion, inertia: RelativeMotion) -> bool:
     x, y = se2.rotate_back(np.cos(one[2]), np.sin(one[2]), dx, dy)
     forward, aside = se2.log_shift(x, y, turn)
     x, y = se2.rotate_back(np.cos(other[2]), np.sin(other[2]), -dx, -dy)
-    spread = inverse_pose_covariance(odometry.covariance, np.array((x, y, -turn))) + inertia.covariance
-    spread += _LEAST_VARIANCE * np.eye(3)
+    # The adjoint of odometry's pose as seen from that by inertia.
+    rows = (np.cos(turn), np.sin(turn), y), (-np.sin(turn), np.cos(turn), -x), (0.0, 0.0, 1.0)
+    covariance, least = symmetric_from_array(odometry.covariance), _LEAST_VARIANCE
+    moved = multiply(covariance, rows[0]), multiply(covariance, rows[1]), multiply(covariance, rows[2])
+    spread = Symmetric(
+        dot(rows[0], moved[0]) + least,
+        dot(rows[0], moved[1]),
+        dot(rows[0], moved[2]),
+        dot(rows[1], moved[1]) + least,
+        dot(rows[1], moved[2]),
+        dot(rows[2], moved[2]) + least,
+    )
     difference = (forward, aside, turn)
-    return bool(dot(difference, solve(symmetric_from_array(spread), difference)) > _JUMP_GATE)
+    spread = add_scaled(spread, symmetric_from_array(inertia.covariance), 1.0)
+    return bool(dot(difference, solve(spread, difference)) > _JUMP_GATE)
 
 
 def is_wide(covariance: Float64, settings: FilterParameters) -> bool:
