@@ -40,6 +40,13 @@ def pytest_configure(config):
         os.nice(10)
 
 
+def pytest_collection_modifyitems(items):
+    """Mark the tests in which nodes run."""
+    for item in items:
+        if item.path.name.startswith(NODES):
+            item.add_marker("nodes")
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
     """The first worker takes the files in which nodes run, the others what only computes.
