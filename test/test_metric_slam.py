@@ -259,7 +259,7 @@ def test_a_robot_whose_area_becomes_part_of_another_goes_on_there():
     hybrid_map = dialogue.slam._replica.maps[1]
     assert hybrid_map.area_ids() == [0]
     assert sorted(hybrid_map.keyframes(0)) == [keyframe.sequence for keyframe in dialogue.messages_of(Keyframe)]
-    assert set(dialogue.slam._best_hypothesis.filter.keyframe_areas) == {0}
+    assert set(dialogue.slam.best_hypothesis.filter.keyframe_areas) == {0}
     # The drift goes on from what it was, with what is not known of how the two lie to each other.
     before, after = (dialogue.messages_of(Keyframe)[k].estimates[0].pose.covariance for k in (13, 14))
     assert np.trace(after[:2, :2]) > np.trace(before[:2, :2]) + 1e-4

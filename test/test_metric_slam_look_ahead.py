@@ -25,18 +25,26 @@ from hmt_slam_ros.messages.messages import (
     PoseReset,
 )
 from hmt_slam_ros.messages.routing import SUBSCRIPTIONS
-from hmt_slam_ros.metric_slam.look_ahead import EarlyEstimateRecord
+from hmt_slam_ros.metric_slam.look_ahead import EarlyEstimateRecord, LookAhead
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.process_table import PROCESSES
 
 BUNDLED = Path(__file__).resolve().parent.parent / "data" / "malaga_one_loop"
 
 
+def slam_without_copies(configuration):
+    """A metric SLAM process that assumes no answer."""
+    slam = metric_slam(configuration)
+    slam.most_assumed = 0
+    return slam
+
+
 class Waiting(Dialogue):
     """A metric SLAM process whose first event gets no answer by itself, and its early estimates."""
 
     def __init__(self, configuration=None):
-        super().__init__(configuration, answer=lambda keyframe: agree(keyframe) if keyframe.sequence else [])
+        super().__init__(answer=lambda keyframe: agree(keyframe) if keyframe.sequence else [])
+        self.slam = slam_without_copies(configuration or Configuration())
         self.early = []
 
     def send(self, *messages):
@@ -48,6 +56,7 @@ class Waiting(Dialogue):
 def late_answer(batch_size=None):
     """A dialogue of eleven scans of which the first one's event was answered last."""
     dialogue = Dialogue(answer=lambda keyframe: [])
+    dialogue.slam = slam_without_copies(Configuration())
     for odometry, scan, _ in drive(11):
         dialogue.send(odometry, scan)
     dialogue.slam.batch_size = batch_size
@@ -93,8 +102,8 @@ def test_all_that_wait_are_processed_before_anything_but_a_measurement(last):
 @pytest.mark.parametrize("kind", ["grid", "lines"])
 def test_scans_that_wait_have_estimates_at_once_and_the_same_afterwards_as_without(kind):
     configuration = load_configuration(settings=[f"local_map.kind={kind}"])
-    ahead, plain = Waiting(), Dialogue(answer=lambda keyframe: [])
-    ahead.slam, plain.slam = metric_slam(configuration), metric_slam(configuration)
+    ahead, plain = Waiting(configuration), Dialogue(answer=lambda keyframe: [])
+    plain.slam = metric_slam(configuration)
     for number, (odometry, scan, pose) in enumerate(drive(25)):
         ahead.send(odometry, scan)
         plain.send(odometry, scan)
@@ -124,6 +133,37 @@ def test_of_many_that_wait_the_newest_alone_has_one():
     dialogue.send(*steps[30][:2])
     assert [estimate.scan_index for estimate in dialogue.early] == [30]
     assert np.hypot(*se2.between(steps[30][2], dialogue.early[0].pose.mean)[:2]) < 0.05
+
+
+def test_when_metric_slam_gets_further_tracking_goes_on_from_there():
+    steps = list(drive(41))
+    dialogue = Dialogue(answer=lambda keyframe: [])
+    dialogue.send(*steps[0][:2])
+    slam, ahead = dialogue.slam, LookAhead(Configuration(), dialogue.slam)
+    for number, (odometry, scan, _) in enumerate(steps[1:40], 1):
+        ahead.add_odometry(odometry)
+        dialogue.send(odometry, scan)
+        assert ahead.follow(slam, slam.processed_scans)
+        assert [estimate.scan_index for estimate in ahead.estimate([scan], number, 0)] == [number]
+    dialogue.send(*agree(dialogue.messages_of(Keyframe)[0]))
+    assert 1 < slam.processed_scans < 39
+    assert ahead.follow(slam, slam.processed_scans)
+    odometry, scan, pose = steps[40]
+    ahead.add_odometry(odometry)
+    (estimate,) = ahead.estimate([scan], 40, 1)
+    assert np.hypot(*se2.between(pose, estimate.pose.mean)[:2]) < 0.05
+    assert np.sqrt(estimate.pose.covariance[2, 2]) < np.radians(1.0)
+
+
+def test_where_the_motion_since_metric_slams_last_scan_is_not_known_tracking_has_to_begin_again():
+    dialogue = Dialogue()
+    steps = list(drive(30))
+    for odometry, scan, _ in steps[:3]:
+        dialogue.send(odometry, scan)
+    ahead = LookAhead(Configuration(), dialogue.slam)
+    for odometry, scan, _ in steps[3:]:
+        dialogue.send(odometry, scan)
+    assert not ahead.follow(dialogue.slam, dialogue.slam.processed_scans)
 
 
 def test_a_scan_whose_odometry_is_not_known_waits():

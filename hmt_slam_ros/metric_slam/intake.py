@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field, replace
-from itertools import takewhile
+from itertools import islice
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
@@ -66,6 +66,7 @@ class ScanQueue:
         self._max_waiting = max_waiting
         self._odometry = odometry
         self._scans = deque(state.scans)
+        self._ready = 0  # of the scans, which odometry covers
         self._sweeps = SweepCheck(state.sweeps)
         # All but the two parts above, which change in place.
         self._state = replace(state, scans=(), sweeps=SweepState())
@@ -121,10 +122,17 @@ class ScanQueue:
             ended or not self._state.waits_for_odometry or self._odometry.covers(self._scans[0].end_stamp)
         )
 
-    def ready_scans(self) -> list[Scan]:
-        """The first scans that can be processed; they stay in the queue."""
-        waits = self._state.waits_for_odometry
-        return list(takewhile(lambda scan: not waits or self._odometry.covers(scan.end_stamp), self._scans))
+    def ready_count(self) -> int:
+        """Number of the first scans that can be processed."""
+        if not self._state.waits_for_odometry:
+            return len(self._scans)
+        while self._ready < len(self._scans) and self._odometry.covers(self._scans[self._ready].end_stamp):
+            self._ready += 1
+        return self._ready
+
+    def waiting_scans(self, begin: int, end: int) -> list[Scan]:
+        """Some of the scans, by their places in the queue, where they stay."""
+        return list(islice(self._scans, begin, end))
 
     @property
     def next_scan(self) -> Scan:
@@ -133,6 +141,7 @@ class ScanQueue:
 
     def pop(self) -> Scan:
         """The next scan."""
+        self._ready = max(0, self._ready - 1)
         return self._scans.popleft()
 
     def _stop_waiting(self) -> list[Message]:

@@ -31,11 +31,9 @@ from hmt_slam_ros.lifelong.change_detection import (
 from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.messages.messages import (
     ClosureDecision,
-    EarlyEstimate,
     EndOfLog,
     EndOfRun,
     Hypotheses,
-    Hypothesis,
     Keyframe,
     LocalEstimate,
     Message,
@@ -46,7 +44,6 @@ from hmt_slam_ros.messages.messages import (
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
 from hmt_slam_ros.metric_slam.intake import Intake, OdometryMonitorState, ScanQueueState
 from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis, LiveHypothesisState
-from hmt_slam_ros.metric_slam.look_ahead import LookAhead
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.sensors.motion_model import MotionState, Prediction
 from hmt_slam_ros.sensors.odometry import deskew_scan
@@ -100,8 +97,10 @@ class MetricSlam:
     """The metric SLAM process.
 
     Consumes Scan, Odometry, PoseReset, Hypotheses, ClosureDecision, EndOfLog; produces TrackingReset, Keyframe,
-    ScanPoses, LocalEstimate, Notice, EndOfRun; and EarlyEstimate, where :meth:`look_ahead` is called.
+    ScanPoses, LocalEstimate, Notice, EndOfRun.
 
+    :ivar mapping: the parts that all filters share.
+    :ivar intake: scans and odometry on their way into the filters.
     :ivar mode: mapping, localization or lifelong; a lost robot maps its surroundings in every mode.
     :ivar batch_size: most scans that are processed at a stretch, None for all that are ready.
     :ivar is_interrupted: whether scans are left since a batch was full; then measurements wait for the next
@@ -121,11 +120,11 @@ class MetricSlam:
         state = state or SlamState()
         self._configuration = configuration
         self.mode = configuration.mode
-        self._mapping = LocalMapping(configuration)
-        self._filters = filters(self._mapping)
+        self.mapping = LocalMapping(configuration)
+        self._filters = filters(self.mapping)
         self._neighborhood = Neighborhood(MAX_AREA_SIGMA, MAX_KEYFRAME_DISTANCE)
         self._replica = Replica.from_state(state.replica)
-        self._intake = Intake(configuration, state.motion, state.odometry_monitor, state.scan_queue)
+        self.intake = Intake(configuration, state.motion, state.odometry_monitor, state.scan_queue)
         self._live_hypotheses = self._restored_hypotheses(state)
         # All but these parts, which change in place.
         self._state = replace(
@@ -141,9 +140,6 @@ class MetricSlam:
         # Not part of the state, since no decision depends on them.
         self.batch_size: int | None = None
         self.is_interrupted = False
-        self._is_fork = False
-        self._look_ahead: LookAhead | None = None
-        self._next_early = 0
 
     def _restored_hypotheses(self, state: SlamState) -> dict[int, LiveHypothesis]:
         if not state.live_hypotheses:
@@ -152,7 +148,7 @@ class MetricSlam:
         hypotheses = state.live_hypotheses
         tables = [live.particle_filter.tables for live in hypotheses.values() if live.particle_filter is not None]
         if state.patches is not None and tables:
-            self._mapping.pool.load(state.patches, np.concatenate(tables))
+            self.mapping.pool.load(state.patches, np.concatenate(tables))
         settings = self._configuration.filter
         return {name: LiveHypothesis.from_state(self._filters, settings, live) for name, live in hypotheses.items()}
 
@@ -160,7 +156,7 @@ class MetricSlam:
     def state(self) -> SlamState:
         """The whole state, as a value."""
         live, patches = self._hypothesis_states()
-        motion, odometry_monitor, scan_queue = self._intake.state
+        motion, odometry_monitor, scan_queue = self.intake.state
         return replace(
             self._state,
             replica=self._replica.state,
@@ -177,7 +173,7 @@ class MetricSlam:
         grids = {name: state.particle_filter for name, state in states.items() if state.particle_filter is not None}
         if not grids:
             return states, None
-        patches, tables = self._mapping.pool.state(np.concatenate([grid.tables for grid in grids.values()]))
+        patches, tables = self.mapping.pool.state(np.concatenate([grid.tables for grid in grids.values()]))
         for (name, grid), own in zip(grids.items(), np.split(tables, len(grids)), strict=True):
             states[name] = replace(states[name], particle_filter=replace(grid, tables=own))
         return states, patches
@@ -198,6 +194,11 @@ class MetricSlam:
         return self._state.awaiting_decision
 
     @property
+    def is_reset_pending(self) -> bool:
+        """Whether tracking restarts at the next scan."""
+        return self._state.reset_pending
+
+    @property
     def keyframe_events(self) -> int:
         """Number of keyframe events so far."""
         return self._state.keyframe_events
@@ -215,20 +216,21 @@ class MetricSlam:
     @property
     def queued_scans(self) -> int:
         """Number of scans in the queue."""
-        return len(self._intake.queue)
+        return len(self.intake.queue)
 
     @property
     def peak_map_bytes(self) -> int:
         """Largest memory of the maps of all particles, bytes."""
-        return self._mapping.pool.peak_bytes
+        return self.mapping.pool.peak_bytes
 
     @property
     def particles(self) -> tuple[int, Float64]:
         """Area of the most probable hypothesis and the poses of its particles, ``area_T_base``, shape (M, 3)."""
-        return self._best_hypothesis.filter.area, self._best_hypothesis.filter.poses
+        return self.best_hypothesis.filter.area, self.best_hypothesis.filter.poses
 
     @property
-    def _best_hypothesis(self) -> LiveHypothesis:
+    def best_hypothesis(self) -> LiveHypothesis:
+        """The most probable hypothesis."""
         return self._live_hypotheses[self._replica.best_hypothesis]
 
     def handle(self, message: Message) -> list[Message]:
@@ -236,7 +238,6 @@ class MetricSlam:
         if isinstance(message, Odometry | Scan):
             notices = self.enqueue(message)
             return notices if self.is_interrupted else notices + self.process_queue()
-        self._look_ahead = None  # whose map changes
         # A slam that handles the journal of a killed one reaches the event of an answer only here.
         answers = self.finish_queue() if self.is_interrupted else []
         return answers + self._handle_answer_or_request(message)
@@ -258,85 +259,10 @@ class MetricSlam:
 
     def enqueue(self, measurement: Odometry | Scan) -> list[Message]:
         """Add a measurement; returns notices of its faults."""
-        if isinstance(measurement, Odometry) and self._look_ahead is not None:
-            self._look_ahead.add_odometry(measurement)
-        return self._intake.add(measurement)
-
-    def look_ahead(self) -> list[EarlyEstimate]:
-        """Estimates of the scans that wait, as far as they have none yet.
-
-        They wait for the answer to a keyframe event, or until later odometry shows whether that before was stale.
-        Results are the same without them.
-        """
-        if self._state.reset_pending:
-            return []
-        scans = self._intake.queue.ready_scans()
-        if not scans or self._state.processed_scans + len(scans) <= self._next_early:
-            return []
-        ahead = self._look_ahead or LookAhead(
-            self._configuration,
-            self._mapping,
-            self._best_hypothesis,
-            self._intake.motion.state,
-            self._state.keyframe_events - 1,
-            self._next_early,
-        )
-        estimates = ahead.estimate(scans, self._state.processed_scans)
-        self._look_ahead, self._next_early = ahead, ahead.next_scan
-        return estimates
-
-    def fork(self) -> MetricSlam:
-        """A copy that goes on before the answer to the last event. It reads the same replica, but adds nothing to it.
-
-        At the end this has to :meth:`adopt` its state, or to :meth:`release` it.
-        """
-        other = MetricSlam.__new__(MetricSlam)
-        vars(other).update(vars(self), _is_fork=True, _look_ahead=None)
-        other._intake = self._intake.copy()
-        other._live_hypotheses = {name: live.branch(name) for name, live in self._live_hypotheses.items()}
-        return other
-
-    def assume_unchanged(self) -> list[Message]:
-        """Go on as if the answer that is due changed nothing; returns the messages of the scans that waited."""
-        self._state = replace(self._state, awaiting_decision=False)
-        return self.process_queue()
-
-    def change_by(self, answer: Hypotheses | ClosureDecision) -> str | None:
-        """What an answer changes in the filters, or in what decides about them; None where nothing is changed.
-
-        Areas and arcs may change all the same.
-        """
-        if isinstance(answer, ClosureDecision):
-            is_unchanged = not answer.moved_keyframes and answer.hypothesis in (None, *self._only_hypothesis())
-            return None if is_unchanged else "closure"
-        hypotheses = answer.hypotheses
-        if {hypothesis.id for hypothesis in hypotheses} != self._live_hypotheses.keys():
-            return "hypotheses"
-        if any(_changes_filter(hypothesis) for hypothesis in hypotheses):
-            return "area"
-        if answer.pruned_keyframes or answer.stale_beams:
-            return "keyframes"
-        if all(hypothesis.lost for hypothesis in hypotheses) != self._state.lost:
-            return "lost"
-        best = min(hypotheses, key=lambda hypothesis: (-hypothesis.probability, hypothesis.id))
-        return None if best.id == self._replica.best_hypothesis else "hypotheses"
-
-    def _only_hypothesis(self) -> list[int]:
-        """The live hypothesis, where there is one."""
-        return list(self._live_hypotheses) if len(self._live_hypotheses) == 1 else []
-
-    def adopt(self, other: MetricSlam, decision: ClosureDecision) -> None:
-        """Go on as a copy, after answers that change no filter.
-
-        :param decision: the last answer.
-        """
-        self._replica.apply_decision(decision)
-        self.release()
-        self._intake, self._live_hypotheses, self._state = other._intake, other._live_hypotheses, other._state
-        self.is_interrupted = other.is_interrupted
+        return self.intake.add(measurement)
 
     def add_to_replica(self, keyframe: Keyframe) -> None:
-        """Add a keyframe that a copy made."""
+        """Add a keyframe to the maps of the live hypotheses."""
         self._replica.add_keyframe(keyframe)
 
     def release(self) -> None:
@@ -355,34 +281,32 @@ class MetricSlam:
         """Process a batch of the scans that are ready, up to the next keyframe event; returns their messages."""
         answers: list[Message] = []
         left, self.is_interrupted = self.batch_size, False
-        while not self._state.awaiting_decision and self._intake.queue.is_ready(ended=self._ended):
+        while not self._state.awaiting_decision and self.intake.queue.is_ready(ended=self._ended):
             # Without odometry at once, before a reading lets them wait again.
-            if left == 0 and self._intake.queue.waits_for_odometry:
+            if left == 0 and self.intake.queue.waits_for_odometry:
                 self.is_interrupted = True
                 break
-            taken = self._intake.take(ended=self._ended)
+            taken = self.intake.take(ended=self._ended)
             if taken is None:
                 break
             scan, notices = taken
             answers += notices + self._process_scan(scan)
             left = left and left - 1
-        if self._ended and not self._intake.queue and not self._state.awaiting_decision:
+        if self._ended and not self.intake.queue and not self._state.awaiting_decision:
             answers += self._finish()
         return answers
 
     def _reset_tracking(self) -> list[Message]:
         """Restart tracking at the next scan; scans that still wait are dropped, as they are from before."""
-        self._next_early = 0
-        dropped = self._state.dropped_scans + len(self._intake.queue)
-        self._intake = self._intake.restart()
+        dropped = self._state.dropped_scans + len(self.intake.queue)
+        self.intake = self.intake.restart()
         self._state = replace(self._state, dropped_scans=dropped, reset_pending=True, motion_condition="ordinary")
         return [TrackingReset(self._state.keyframe_events, self._state.processed_scans)]
 
     def _process_scan(self, scan: Scan) -> list[Message]:
-        self._look_ahead = None  # whose filter goes on
-        motion = self._intake.motion
+        motion = self.intake.motion
         prediction = motion.predict(scan.stamp)
-        prepared = PreparedScan(self._mapping, deskew_scan(scan, motion.odometry, self._configuration.rtl))
+        prepared = PreparedScan(self.mapping, deskew_scan(scan, motion.odometry, self._configuration.rtl))
         messages: list[Message] = []
         if self._state.reset_pending:
             self._reset_filters(prediction)
@@ -391,7 +315,7 @@ class MetricSlam:
         if (
             self._state.reset_pending
             or self._state.initial_pose is not None
-            or self._best_hypothesis.is_event_due(prepared)
+            or self.best_hypothesis.is_event_due(prepared)
         ):
             messages += self._keyframe_event(prepared)
         for live in self._live_hypotheses.values():
@@ -417,7 +341,7 @@ class MetricSlam:
         path_length = self._state.path_length + math.hypot(best.increment[0], best.increment[1])
         condition = self._motion_condition(prediction, contradicted=best.contradicts_odometry)
         self._state = replace(self._state, path_length=path_length, motion_condition=condition)
-        return self._intake.observe(prepared.scan.stamp, prediction, best)
+        return self.intake.observe(prepared.scan.stamp, prediction, best)
 
     def _motion_condition(self, prediction: Prediction, *, contradicted: bool) -> MotionCondition:
         """The condition of the motion since the last keyframe event, with one more scan.
@@ -426,7 +350,7 @@ class MetricSlam:
         """
         if prediction.after_gap or self._state.motion_condition == "after_gap":
             return "after_gap"
-        if contradicted or is_wide(self._best_hypothesis.filter.tracking_covariance, self._configuration.filter):
+        if contradicted or is_wide(self.best_hypothesis.filter.tracking_covariance, self._configuration.filter):
             return "uncertain"
         return self._state.motion_condition
 
@@ -445,8 +369,8 @@ class MetricSlam:
             )
             for live in self._live_hypotheses.values()
         )
-        last = self._best_hypothesis.event
-        self._intake.motion.observe_keyframe(last.motion, last.match_information)
+        last = self.best_hypothesis.event
+        self.intake.motion.observe_keyframe(last.motion, last.match_information)
         after_reset, initial_pose = self._state.reset_pending, self._state.initial_pose
         keyframe = Keyframe(
             sequence,
@@ -459,8 +383,7 @@ class MetricSlam:
             combine_stale_beams(changes),
             self._state.motion_condition,
         )
-        if not self._is_fork:
-            self._replica.add_keyframe(keyframe)
+        self.add_to_replica(keyframe)
         # An initial pose is kept for one more event: the next scan is searched for there, even if the robot stands.
         self._state = replace(
             self._state,
@@ -470,7 +393,7 @@ class MetricSlam:
             initial_pose=initial_pose if after_reset else None,
             motion_condition="ordinary",
         )
-        return [*scan_poses, keyframe, *self._intake.check_noise()]
+        return [*scan_poses, keyframe, *self.intake.check_noise()]
 
     @property
     def _is_lifelong(self) -> bool:
@@ -501,13 +424,13 @@ class MetricSlam:
         return scan_poses
 
     def _local_estimate(self, stamp: int) -> LocalEstimate:
-        best, state = self._best_hypothesis, self._state
+        best, state = self.best_hypothesis, self._state
         return LocalEstimate(
             stamp,
             state.processed_scans - 1,
             best.filter.area,
             best.pose_belief(),
-            self._intake.motion.odometry_pose,
+            self.intake.motion.odometry_pose,
             state.dropped_scans,
         )
 
@@ -576,14 +499,4 @@ class MetricSlam:
         self._ended = False
         processed, dropped = self._state.processed_scans, self._state.dropped_scans
         finished = EndOfRun(processed + dropped, processed, dropped)
-        return [*self._take_scan_poses(), *self._intake.end(), finished]
-
-
-def _changes_filter(hypothesis: Hypothesis) -> bool:
-    """Whether a hypothesis begins, or gets another local map, or loses the robot."""
-    return (
-        hypothesis.id != hypothesis.parent
-        or bool(hypothesis.local_areas)
-        or hypothesis.area_merge is not None
-        or hypothesis.tracking_reset
-    )
+        return [*self._take_scan_poses(), *self.intake.end(), finished]

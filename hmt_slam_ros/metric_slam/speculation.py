@@ -18,17 +18,19 @@ from hmt_slam_ros.messages.messages import (
     ClosureDecision,
     EarlyEstimate,
     Hypotheses,
+    Hypothesis,
     Keyframe,
     LocalEstimate,
     Message,
 )
+from hmt_slam_ros.metric_slam.look_ahead import LookAhead
 from hmt_slam_ros.metric_slam.slam import MetricSlam, SlamState
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.submap.local_filter import FilterFactory
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 from hmt_slam_ros.submap.particle_filter import ParticleFilters
 
-_MOST_FORKS = 2
+_MOST_ASSUMED = 2
 """Keyframe events whose answers may be assumed; more make a wrong assumption dearer."""
 
 
@@ -66,20 +68,37 @@ class _Step(NamedTuple):
     answers: Sequence[Message]
 
 
-@dataclass
-class _Fork:
-    """A copy that assumes an answer.
+class _Fork(MetricSlam):
+    """A copy that goes on before the answer to the last event. It reads the same replica, but adds nothing to it.
+
+    At the end :class:`SpeculativeSlam` has to adopt it, or to release its maps.
 
     :ivar answers: the messages that follow the answer at once.
     :ivar seconds: computing time, s.
     """
 
-    slam: MetricSlam
-    answers: list[Message] = field(default_factory=list)
-    seconds: float = 0.0
+    answers: list[Message]
+    seconds: float
+
+    @classmethod
+    def from_slam(cls, slam: MetricSlam) -> _Fork:
+        """A copy in the same state."""
+        fork = cls.__new__(cls)
+        vars(fork).update(vars(slam), answers=[], seconds=0.0)
+        fork.intake = slam.intake.copy()
+        fork._live_hypotheses = {name: live.branch(name) for name, live in fork._live_hypotheses.items()}
+        return fork
+
+    def add_to_replica(self, keyframe: Keyframe) -> None:
+        """Add nothing: the keyframe is part of the map once the copy is adopted."""
+
+    def assume_unchanged(self) -> list[Message]:
+        """Go on as if the answer that is due changed nothing; returns the messages of the scans that waited."""
+        self._state = replace(self._state, awaiting_decision=False)
+        return self.process_queue()
 
     def compute(self, work: Callable[[], list[Message]]) -> list[Message]:
-        """The messages of some work of the copy."""
+        """The messages of some work of this copy."""
         begin = time.perf_counter()
         answers = work()
         self.seconds += time.perf_counter() - begin
@@ -92,6 +111,7 @@ class SpeculativeSlam(MetricSlam):
     A runtime that has the measurements before their turn calls :meth:`work_ahead`. One in which they come while an
     answer is due calls :meth:`look_ahead`. Without either it is :class:`MetricSlam`.
 
+    :ivar most_assumed: number of answers that may be assumed at a time.
     :ivar record: how often it worked ahead.
     """
 
@@ -108,6 +128,9 @@ class SpeculativeSlam(MetricSlam):
         # Measurements that this has and the copies do not.
         self._unseen = list[Scan | Odometry]()
         self._early = list[EarlyEstimate]()
+        self._look_ahead: LookAhead | None = None
+        self._next_early = 0
+        self.most_assumed = _MOST_ASSUMED
         self.record = SpeculationRecord()
 
     @property
@@ -135,17 +158,18 @@ class SpeculativeSlam(MetricSlam):
 
     @property
     def _front(self) -> MetricSlam:
-        return self._forks[-1].slam if self._forks else self
+        return self._forks[-1] if self._forks else self
 
     @property
     def _may_fork(self) -> bool:
         """Whether one more answer may be assumed. In mode lifelong an event depends on all keyframes before it."""
         is_due = self.is_awaiting_decision and not self._state.reset_pending
-        return is_due and len(self._forks) < _MOST_FORKS and self.mode != "lifelong"
+        return is_due and len(self._forks) < self.most_assumed and self.mode != "lifelong"
 
     def _fork_front(self) -> None:
-        self._forks.append(_Fork(self._front.fork()))
-        self._go_on(self._front.assume_unchanged)
+        fork = _Fork.from_slam(self._front)
+        self._forks.append(fork)
+        self._go_on(fork.assume_unchanged)
 
     def work_ahead(self, measurement: Scan | Odometry) -> bool:
         """Process a measurement before its turn, the first that was not; :meth:`handle` gets it later.
@@ -164,24 +188,42 @@ class SpeculativeSlam(MetricSlam):
         return True
 
     def look_ahead(self) -> list[EarlyEstimate]:
-        """As in :class:`MetricSlam`; scans that wait for an answer are processed ahead, up to one further event."""
+        """Estimates of the scans that wait, as far as they have none yet; results are the same without them.
+
+        They wait for the answer to a keyframe event, or until later odometry shows whether that before was stale. Up to
+        one further event is processed ahead.
+        """
         if self._forks:
             self._pass_on()
         if self._front.is_awaiting_decision and self._may_fork:
             self._fork_front()
-        front, event = self._front, self.keyframe_events - 1
         early = [estimate for estimate in self._early if estimate.scan_index >= self._next_early]
         self._early = []
-        front._next_early = max([self._next_early, *(estimate.scan_index + 1 for estimate in early)])
-        early += [replace(estimate, event=event) for estimate in MetricSlam.look_ahead(front)]
-        self._next_early = front._next_early
-        return early
+        self._note_early(early)
+        tracked = self._track_waiting()
+        self._note_early(tracked)
+        return early + tracked
+
+    def _note_early(self, estimates: Sequence[EarlyEstimate]) -> None:
+        self._next_early = max([self._next_early, *(estimate.scan_index + 1 for estimate in estimates)])
+
+    def _track_waiting(self) -> list[EarlyEstimate]:
+        """Estimates of scans that no copy may process; where tracking begins, of the newest alone."""
+        front, queue = self._front, self._front.intake.queue
+        first, end = front.processed_scans, front.processed_scans + queue.ready_count()
+        begin = max(first, self._next_early)
+        if front.is_reset_pending or begin >= end:
+            return []
+        if self._look_ahead is None or not self._look_ahead.follow(front, self.processed_scans):
+            self._look_ahead, begin = LookAhead(self._configuration, front), end - 1
+        scans = queue.waiting_scans(begin - first, end - first)
+        return list(self._look_ahead.estimate(scans, begin, self.keyframe_events - 1))
 
     def _pass_on(self) -> None:
         """Give the copies what has come."""
         for measurement in self._unseen:
             for fork in self._forks:
-                fork.slam.enqueue(measurement)
+                fork.enqueue(measurement)
             if not self._front.is_interrupted:
                 self._go_on(self._front.process_queue)
         self._unseen = []
@@ -201,6 +243,8 @@ class SpeculativeSlam(MetricSlam):
         """As in :class:`MetricSlam`."""
         if isinstance(message, Scan | Odometry):
             return self._handle_measurement(message)
+        if self._look_ahead is not None:
+            self._look_ahead.leave_map()
         if self._forks and (cause := self._contradiction(message)) is not None:
             self._drop_forks(cause)
         if self._forks and isinstance(message, ClosureDecision):
@@ -208,6 +252,8 @@ class SpeculativeSlam(MetricSlam):
         return super().handle(message)
 
     def _handle_measurement(self, measurement: Scan | Odometry) -> list[Message]:
+        if self._look_ahead is not None and isinstance(measurement, Odometry):
+            self._look_ahead.add_odometry(measurement)
         if self._steps:
             step = self._steps.popleft()
             assert step.measurement is measurement
@@ -219,14 +265,45 @@ class SpeculativeSlam(MetricSlam):
     def _contradiction(self, message: Message) -> str | None:
         """What a message changes that the copies assume, None where nothing."""
         if isinstance(message, Hypotheses | ClosureDecision) and self._front.mode == self.mode:
-            return self.change_by(message)
+            return self._change_by(message)
         return "reset"
+
+    def _change_by(self, answer: Hypotheses | ClosureDecision) -> str | None:
+        """What an answer changes in the filters, or in what decides about them; None where nothing is changed.
+
+        Areas and arcs may change all the same.
+        """
+        if isinstance(answer, ClosureDecision):
+            is_unchanged = not answer.moved_keyframes and answer.hypothesis in (None, *self._only_hypothesis())
+            return None if is_unchanged else "closure"
+        hypotheses = answer.hypotheses
+        if {hypothesis.id for hypothesis in hypotheses} != self._live_hypotheses.keys():
+            return "hypotheses"
+        if any(_changes_filter(hypothesis) for hypothesis in hypotheses):
+            return "area"
+        if answer.pruned_keyframes or answer.stale_beams:
+            return "keyframes"
+        if all(hypothesis.lost for hypothesis in hypotheses) != self._state.lost:
+            return "lost"
+        best = min(hypotheses, key=lambda hypothesis: (-hypothesis.probability, hypothesis.id))
+        return None if best.id == self._replica.best_hypothesis else "hypotheses"
+
+    def _only_hypothesis(self) -> list[int]:
+        """The live hypothesis, where there is one."""
+        return list(self._live_hypotheses) if len(self._live_hypotheses) == 1 else []
+
+    def _reset_tracking(self) -> list[Message]:
+        self._look_ahead, self._next_early = None, 0
+        return super()._reset_tracking()
 
     def _adopt_fork(self, decision: ClosureDecision) -> list[Message]:
         """Go on as the copy that assumed this answer; returns what it has sent since."""
         self._pass_on()
         fork = self._forks.popleft()
-        self.adopt(fork.slam, decision)
+        self._replica.apply_decision(decision)
+        self.release()
+        self.intake, self._live_hypotheses, self._state = fork.intake, fork._live_hypotheses, fork._state
+        self.is_interrupted = fork.is_interrupted
         self._early = [estimate for estimate in self._early if estimate.scan_index >= self.processed_scans]
         self.record.confirmed += 1
         return self._send(fork.answers)
@@ -240,7 +317,7 @@ class SpeculativeSlam(MetricSlam):
 
     def _drop_forks(self, cause: str) -> None:
         for fork in self._forks:
-            fork.slam.release()
+            fork.release()
             self.record.repeated += _count_scans(fork.answers)
             self.record.dropped_seconds += fork.seconds
         self.record.refuted[cause] = self.record.refuted.get(cause, 0) + 1
@@ -252,3 +329,13 @@ class SpeculativeSlam(MetricSlam):
 
 def _count_scans(answers: Sequence[Message]) -> int:
     return sum(isinstance(answer, LocalEstimate) for answer in answers)
+
+
+def _changes_filter(hypothesis: Hypothesis) -> bool:
+    """Whether a hypothesis begins, or gets another local map, or loses the robot."""
+    return (
+        hypothesis.id != hypothesis.parent
+        or bool(hypothesis.local_areas)
+        or hypothesis.area_merge is not None
+        or hypothesis.tracking_reset
+    )
