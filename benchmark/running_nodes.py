@@ -29,6 +29,7 @@ from hmt_slam_ros.ros.topics import DOCUMENTS
 Parameters = Mapping[str, str | float | list[float]]
 _TIMEOUT = 120.0  # s
 _SPIN = 0.005  # s
+_LOST = 0.5  # s, after which a request is sent again: DDS may lose that of a client which a new node does not know
 NODES = (*process_names(), "robot")
 
 
@@ -68,7 +69,11 @@ class Listener:
         while not condition():
             if time.monotonic() > deadline:
                 raise HmtSlamError(f"a node did not answer within {timeout:g} s: see whether scripts/demo.sh runs")
-            self._executor.spin_once(timeout_sec=_SPIN)
+            self.spin_once()
+
+    def spin_once(self) -> None:
+        """Take what has come."""
+        self._executor.spin_once(timeout_sec=_SPIN)
 
     @contextmanager
     def running(
@@ -108,8 +113,11 @@ def time_until_answer(name: str) -> StartTime:
         begin = time.monotonic()
         with listener.running(name, _waiting_robot(log.path) if name == "robot" else {}) as process:
             listener.wait_until(client.service_is_ready)
-            answer = client.call_async(ListParameters.Request())
-            listener.wait_until(answer.done)
+            requests, again = [client.call_async(ListParameters.Request())], time.monotonic() + _LOST
+            while not any(request.done() for request in requests):
+                listener.spin_once()
+                if time.monotonic() > again:
+                    requests, again = [*requests, client.call_async(ListParameters.Request())], again + _LOST
             return StartTime(time.monotonic() - begin, _cpu_seconds(process))
 
 

@@ -30,7 +30,7 @@ CPU_BOUNDS = {"aces": 15.0, "intel": 25.0}
 MEMORY_BOUNDS = {"intel": 350e6}
 """Largest resident memory, bytes."""
 
-START_BOUND = 3.0
+START_BOUND = 1.0
 """Largest time until a node answers, kernels compiled before, s."""
 
 _REPEATS = 5
