@@ -58,6 +58,12 @@ def pytest_xdist_make_scheduler(config, log):
 
     class NodesInTurn(LoadFileScheduling):
         def _assign_work_unit(self, node):
+            # A worker that dies gives back the files that it has completed, too. One without tests would be waited for.
+            for file in [file for file, tests in self.workqueue.items() if all(tests.values())]:
+                del self.workqueue[file]
+            if not self.workqueue:
+                node.shutdown()
+                return
             runs_nodes = node is self.nodes[0]
             for file in sorted(self.workqueue, key=lambda file: not name_of(file).startswith(LONG)):
                 if name_of(file).startswith(NODES) == runs_nodes:
