@@ -299,6 +299,23 @@ def test_where_arcs_are_wide_keyframes_begin_an_area_at_once_and_are_compared_th
     np.testing.assert_allclose(arc.pose.mean, se2.inverse(fit(6, 0.0).mode.measured.mean))
 
 
+@pytest.mark.parametrize(("kind", "compared", "goes_on"), [("cut", [12, 13], True), ("recheck", [10, 11], False)])
+def test_halfway_to_the_end_of_the_local_map_keyframes_begin_an_area_before_they_are_compared(kind, compared, goes_on):
+    given = GivenComparison(AreaComparison(Transition({6: 0.1}, 1.0), (), (6,), (), 0.0), 3)
+    branching, parent = given.branching(), make_parent()
+    ongoing = OngoingComparison(branching.query(parent, compared), frozenset({1}), kind, {}, {}, ())
+    parent = replace(parent, state=replace(parent.state, comparison=ongoing))
+    assert waiting(branching.cut(parent, [12, 13, 14])) is ongoing
+    parent.hybrid_map.set_keyframe(14, 1, np.array([0.6 * Configuration().local_map.extent, 0.0, 0.0]))
+    (child,) = branching.cut(parent, [12, 13, 14]).children
+    assert (child.area, child.log_weight) == (7, -0.7)
+    assert {moved.keyframe for moved in child.moved_keyframes} == {12, 13, 14}
+    assert bool(given.requested) != goes_on
+    comparison = child.state.comparison
+    assert (comparison.kind, list(comparison.query.poses)) == ("recheck", compared if goes_on else [12, 13, 14])
+    np.testing.assert_array_equal(comparison.query.belief.mean, np.zeros(3))
+
+
 def test_where_the_robot_is_tracked_into_an_area_the_submap_gives_the_pose():
     nudged = se2.compose(ARC, [0.02, -0.01, 0.005])
     branching = make_branching(tracked_area=lambda *_: 2)

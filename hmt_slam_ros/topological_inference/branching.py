@@ -71,6 +71,13 @@ _UNCONFIRMED_INFLATION = 100.0
 """Factor on the covariance of an arc along other arcs that no match confirms: it adds next to nothing to those."""
 
 
+_MAX_LOCAL_MAP_SHARE = 0.5
+"""Share of the half side of the local map within which keyframes wait for their comparison: beyond it nothing is kept.
+
+A laser sees farther than the robot is. From docs/decisions/0063-cut-before-the-end-of-the-map.md.
+"""
+
+
 @dataclass(frozen=True)
 class BranchingState:
     """What branching remembers beside the maps of the hypotheses.
@@ -114,6 +121,7 @@ class Branching:
         self.options = configuration.tsbi
         self.kidnapping_priors = KidnappingPriors.from_configuration(configuration)
         self._filter = configuration.filter
+        self._local_map_extent = configuration.local_map.extent
         self._replica = replica
         sigma, angle = configuration.tlca.arc_sigma_floor, math.radians(configuration.tlca.arc_angle_floor)
         self._covariance_floor = np.diag([sigma**2, sigma**2, angle**2])
@@ -194,28 +202,37 @@ class Branching:
 
         Where the keyframes lie in the place of an area of the submap there is one child: the robot is tracked there.
         Until the comparison with known areas ends nothing is cut: area abstraction repeats the cut. But where the arcs
-        are too wide for one area, the keyframes begin a new one at once, and are compared there.
+        are too wide for one area, or the robot comes to the end of its local map, the keyframes begin a new area at
+        once, and are compared there.
         """
         query, ongoing = self.query(parent, keyframes), parent.state.comparison
         if is_wide(query.belief.covariance, self._filter):
             found = self._compare_cut(parent, query, {parent.area})
             if isinstance(found, OngoingComparison):
-                return Branches([self._enter_meanwhile(parent, found)])
+                return Branches([self._enter_meanwhile(parent, query, found)])
             return self._branch_at_cut(parent, query, found)
+        is_far = self._is_far_from_origin(parent, keyframes)
+        if ongoing is not None and is_far and not _belongs_to_cut(ongoing, keyframes):
+            ongoing = None  # of keyframes that stay behind
         if ongoing is None:
             local_areas = parent.local_area_poses()
             tracked = self.search.tracked_area(parent.hybrid_map, parent.area, local_areas, query.poses_in_area)
             if tracked is not None:
                 return Branches([self._enter_tracked(parent, query, tracked)])
             found = self._compare_cut(parent, query, {parent.area, *local_areas})
-        elif ongoing.kind == "cut" and ongoing.query.poses.keys() <= set(keyframes):
+        elif _belongs_to_cut(ongoing, keyframes):
             found = self.search.continue_comparison(parent.hybrid_map, ongoing)
             query = self.query(parent, keyframes, next(iter(ongoing.query.poses)))
         else:
             return self.continue_comparison(parent, ongoing)
         if isinstance(found, OngoingComparison):
-            return Branches([self._wait(parent, found)])
+            return Branches([self._enter_meanwhile(parent, query, found) if is_far else self._wait(parent, found)])
         return self._branch_at_cut(parent, query, found)
+
+    def _is_far_from_origin(self, parent: Parent, keyframes: Sequence[int]) -> bool:
+        """Whether the newest of some keyframes is halfway to the end of the local map or beyond."""
+        x, y, _ = parent.hybrid_map.keyframes(parent.area)[max(keyframes)]
+        return math.hypot(x, y) > _MAX_LOCAL_MAP_SHARE * self._local_map_extent
 
     def _compare_cut(
         self, parent: Parent, query: Query, excluded: Collection[int]
@@ -280,9 +297,9 @@ class Branching:
         """The only child while a comparison goes on."""
         return parent.unchanged_child(replace(parent.state, comparison=comparison))
 
-    def _enter_meanwhile(self, parent: Parent, comparison: OngoingComparison) -> Child:
-        """The only child, in a new area of the keyframes, while their comparison goes on."""
-        child = self._enter_new(parent, comparison.query, 0.0)
+    def _enter_meanwhile(self, parent: Parent, query: Query, comparison: OngoingComparison) -> Child:
+        """The only child, in a new area of the keyframes ``query``, while the comparison of some of them goes on."""
+        child = self._enter_new(parent, query, 0.0)
         reference = next(iter(comparison.query.poses))
         belief = PoseGaussian(np.zeros(3), child.state.covariances[reference] + self._covariance_floor)
         comparison = replace(comparison, query=Query(belief, comparison.query.poses), kind="recheck")
@@ -480,6 +497,11 @@ class Branching:
         is_found = fit.area in _searched_areas(parent)
         state = replace(parent.state, localization=Tracking()) if is_found else parent.state
         return replace(parent.unchanged_child(state), log_weight=log_weight, arcs=(arc,), reload_local_map=True)
+
+
+def _belongs_to_cut(comparison: OngoingComparison, keyframes: Sequence[int]) -> bool:
+    """Whether a comparison is that of a cut, whose keyframes are among these."""
+    return comparison.kind == "cut" and comparison.query.poses.keys() <= set(keyframes)
 
 
 def _lose(child: Child, parent: Parent, query: Query) -> Child:
