@@ -261,7 +261,7 @@ def test_a_scan_that_fits_in_several_ways_is_measured_by_the_heaviest():
     parent, branching, newest = rooms_apart((PILLARS, PILLARS), ((0.3, 0.1),), 0.8)
     truth = se2.between(PATH[0], PATH[5])
     prior = PoseGaussian(truth, np.diag([0.8, 0.8, math.radians(5.0)]) ** 2)
-    scan = branching._replica.scans[newest[-1]]
+    scan = branching.entry._replica.scans[newest[-1]]
     measured = branching.search.measure_pose(parent.hybrid_map, 0, parent.area, scan, prior)
     np.testing.assert_allclose(measured.mean, truth, atol=0.1)
 

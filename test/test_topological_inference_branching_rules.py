@@ -15,6 +15,7 @@ from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, MovedKeyframe
 from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.registration.area_to_area import MatchMode
+from hmt_slam_ros.topological_inference import area_entry
 from hmt_slam_ros.topological_inference import branching as module
 from hmt_slam_ros.topological_inference.area_comparison import AreaComparison, Fit, OngoingComparison
 from hmt_slam_ros.topological_inference.branches import Parent
@@ -95,21 +96,21 @@ def moved_covariance(entry, relative, relative_covariance):
 
 def test_a_query_is_seen_from_its_first_keyframe_with_the_covariance_of_that():
     parent, branching = make_parent(), make_branching()
-    query = branching.query(parent, [12, 13, 14])
+    query = branching.entry.query(parent, [12, 13, 14])
     own = parent.hybrid_map.keyframes(1)
     np.testing.assert_array_equal(query.belief.mean, own[12])
     np.testing.assert_allclose(query.belief.covariance, growing(2) + FLOOR)
     assert list(query.poses) == [12, 13, 14]
     np.testing.assert_allclose(query.poses[14], se2.between(own[12], own[14]))
-    unknown = branching.query(replace(parent, state=HypothesisState()), [12])
+    unknown = branching.entry.query(replace(parent, state=HypothesisState()), [12])
     np.testing.assert_allclose(unknown.belief.covariance, FLOOR)
 
 
 @pytest.mark.parametrize("arc", [None, PoseGaussian(np.array([1.0, -2.0, 0.5]), 2.0 * SPREAD)])
 def test_keyframes_enter_an_area_with_the_covariance_of_the_entry_and_of_their_way_since(arc):
     parent, branching = make_parent(kidnapping_evidence={3: 1.0}), make_branching()
-    query, entry = branching.query(parent, [12, 13, 14]), PoseGaussian(np.array([5.0, -1.0, 2.0]), 3.0 * SPREAD)
-    child = branching.enter_area(parent, query, 2, entry, arc, 0.25)
+    query, entry = branching.entry.query(parent, [12, 13, 14]), PoseGaussian(np.array([5.0, -1.0, 2.0]), 3.0 * SPREAD)
+    child = branching.entry.enter_area(parent, query, 2, entry, arc, 0.25)
     assert (child.parent, child.area, child.reload_local_map) == (4, 2, True)
     assert child.log_weight == pytest.approx(-0.45)
     assert [(m.keyframe, m.previous_area, m.area) for m in child.moved_keyframes] == [(k, 1, 2) for k in (12, 13, 14)]
@@ -138,7 +139,7 @@ def test_keyframes_enter_an_area_with_the_covariance_of_the_entry_and_of_their_w
 
 @pytest.mark.parametrize(("area", "closure"), [(0, False), (2, True), (6, True), (7, False)])
 def test_an_arc_to_a_known_area_that_none_joined_closes_a_loop(area, closure):
-    arc = module._make_arc(make_parent(), area, PoseGaussian(ARC, SPREAD))
+    arc = area_entry._make_arc(make_parent(), area, PoseGaussian(ARC, SPREAD))
     assert (arc.source, arc.target, arc.closure) == (1, area, closure)
 
 
@@ -161,7 +162,7 @@ def test_a_cut_branches_over_new_ground_and_every_fit_by_their_weights():
     assert (new.area, [child.area for child in known]) == (7, [2, 6])
     np.testing.assert_array_equal(new.moved_keyframes[0].pose, np.zeros(3))
     assert not new.arcs[0].closure
-    query = branching.query(parent, [12, 13, 14])
+    query = branching.entry.query(parent, [12, 13, 14])
     np.testing.assert_allclose(new.arcs[0].pose.covariance, query.belief.covariance)
     for child, each in zip(known, fits, strict=True):
         np.testing.assert_allclose(child.moved_keyframes[0].pose, each.mode.pose.mean)
@@ -171,10 +172,10 @@ def test_a_cut_branches_over_new_ground_and_every_fit_by_their_weights():
     hybrid_map, area, _, _, excluded, most, kind, only = given.requested[0]
     assert (hybrid_map, area, excluded, kind, tuple(only)) == (parent.hybrid_map, 1, {0, 1}, "cut", ())
     assert most == 6  # 20 comparisons by the probability
-    assert branching.new_area(parent, query) == 7
-    assert branching.new_area(parent, branching.query(parent, [13])) == 8
+    assert branching.entry.new_area(parent, query) == 7
+    assert branching.entry.new_area(parent, branching.entry.query(parent, [13])) == 8
     branching.begin_event()
-    assert branching.new_area(parent, query) == 9
+    assert branching.entry.new_area(parent, query) == 9
 
 
 @pytest.mark.parametrize(("probability", "most"), [(1.0, 9), (0.44, 9), (0.31, 7), (0.001, module.MIN_EXAMINED_AREAS)])
@@ -182,7 +183,7 @@ def test_more_areas_are_examined_the_more_probable_the_hypothesis_is(probability
     requested = []
     branching = make_branching(begin_comparison=lambda *given: requested.append(given[5]))
     parent = replace(make_parent(), probability=probability)
-    branching._begin_comparison(parent, branching.query(parent, [12]), (), "cut")
+    branching._begin_comparison(parent, branching.entry.query(parent, [12]), (), "cut")
     assert requested == [most]
 
 
@@ -214,7 +215,7 @@ def test_a_recheck_leaves_keyframes_where_they_are_and_joins_the_areas(only, fit
         assert child.log_weight == pytest.approx(-2.7)
         (arc,) = child.arcs
         assert (arc.source, arc.target, arc.closure) == (1, 6, True)
-        expected = branching.query(parent, keyframes).belief.compose(fits[0].mode.measured.inverse())
+        expected = branching.entry.query(parent, keyframes).belief.compose(fits[0].mode.measured.inverse())
         np.testing.assert_allclose(arc.pose.mean, expected.mean)
         np.testing.assert_allclose(arc.pose.covariance, expected.covariance)
 
@@ -270,7 +271,7 @@ def test_keyframes_are_cut_at_the_event_of_their_last_comparison_together_with_n
 def test_a_cut_waits_for_the_comparison_of_others(kind, compared):
     given = GivenComparison(AreaComparison(Transition({6: 0.1}, 1.0), (), (6,), (), 0.0), 2)
     branching, parent = given.branching(), make_parent()
-    ongoing = OngoingComparison(branching.query(parent, compared), frozenset({1}), kind, {}, {}, ())
+    ongoing = OngoingComparison(branching.entry.query(parent, compared), frozenset({1}), kind, {}, {}, ())
     parent = replace(parent, state=replace(parent.state, comparison=ongoing))
     assert waiting(branching.cut(parent, [12, 13, 14])) is ongoing
     (child,) = branching.cut(parent, [12, 13, 14]).children
@@ -303,7 +304,7 @@ def test_where_arcs_are_wide_keyframes_begin_an_area_at_once_and_are_compared_th
 def test_halfway_to_the_end_of_the_local_map_keyframes_begin_an_area_before_they_are_compared(kind, compared, goes_on):
     given = GivenComparison(AreaComparison(Transition({6: 0.1}, 1.0), (), (6,), (), 0.0), 3)
     branching, parent = given.branching(), make_parent()
-    ongoing = OngoingComparison(branching.query(parent, compared), frozenset({1}), kind, {}, {}, ())
+    ongoing = OngoingComparison(branching.entry.query(parent, compared), frozenset({1}), kind, {}, {}, ())
     parent = replace(parent, state=replace(parent.state, comparison=ongoing))
     assert waiting(branching.cut(parent, [12, 13, 14])) is ongoing
     parent.hybrid_map.set_keyframe(14, 1, np.array([0.6 * Configuration().local_map.extent, 0.0, 0.0]))
@@ -324,7 +325,7 @@ def test_where_the_robot_is_tracked_into_an_area_the_submap_gives_the_pose():
     assert (child.area, child.log_weight, child.arcs) == (2, -0.7, ())
     own = parent.hybrid_map.keyframes(1)
     np.testing.assert_allclose(child.moved_keyframes[0].pose, se2.compose(se2.inverse(nudged), own[12]))
-    moved = branching.move(parent, 2).children[0]
+    moved = branching.entry.move(parent, 2).children[0]
     assert (moved.area, moved.log_weight, moved.reload_local_map, moved.moved_keyframes) == (2, -0.7, True, ())
     expected = PoseGaussian(nudged, 0.5 * SPREAD).inverse()
     np.testing.assert_allclose(moved.frame_change.mean, expected.mean)
@@ -348,7 +349,7 @@ def test_an_overlap_is_joined_by_the_arc_that_the_newest_scan_measures():
     measured, requested = PoseGaussian(np.array([0.4, 0.3, -0.2]), 0.1 * SPREAD), []
     branching = make_branching(measure_pose=lambda *given: requested.append(given) or measured)
     parent, pose = make_parent(unlinked_overlap=(2, 3)), PoseGaussian(np.array([2.0, 1.0, 0.4]), SPREAD)
-    (child,) = branching.link(parent, 2, None, pose).children
+    (child,) = branching.entry.link(parent, 2, None, pose).children
     (arc,) = child.arcs
     assert (arc.source, arc.target, arc.closure) == (1, 2, True)
     expected = pose.compose(measured.inverse())

@@ -55,7 +55,7 @@ def spawn(rooms, evidence, first=FAR, hall=2):
     """
     parent, branching, newest = rooms_apart(rooms, [first, *[FAR] * (len(rooms) - 2)], 0.1)
     for k, keyframe in enumerate(newest[:hall]):
-        branching._replica.scans[keyframe] = scan_in(
+        branching.entry._replica.scans[keyframe] = scan_in(
             HALL, PATH[k], noise=0.01, seed=keyframe, field_of_view=2 * np.pi, beams=361
         )
     state = replace(parent.state, kidnapping_evidence={newest[n]: nats for n, nats in evidence.items()})
@@ -256,7 +256,7 @@ def test_a_new_area_is_drawn_at_the_initial_pose_in_the_frame_of_the_area_before
     pose = np.array([1.0, -0.5, 0.7])
     keyframe = Keyframe(
         newest[-1],
-        branching._replica.scans[newest[-1]],
+        branching.entry._replica.scans[newest[-1]],
         1.0,
         (),
         motion_unknown=True,
@@ -288,7 +288,7 @@ def test_an_initial_pose_replaces_the_false_alarm():
     initial_pose = InitialPose(0, PoseGaussian(se2.between(PATH[0], PATH[5]), np.diag([0.3, 0.3, 0.2]) ** 2))
     pose = parent.hybrid_map.keyframes(2)[newest[-1]]
     keyframe = Keyframe(
-        newest[-1], branching._replica.scans[newest[-1]], 1.0, (), initial_pose=initial_pose, mapping=False
+        newest[-1], branching.entry._replica.scans[newest[-1]], 1.0, (), initial_pose=initial_pose, mapping=False
     )
     branches = relocalization.begin_relocalization(branching, replace(parent, state=state), keyframe, pose)
     lost = [child.state.localization for child in branches.children if child.state.is_lost]

@@ -73,7 +73,7 @@ def make_tsbi():
     tsbi = Tsbi(Configuration())
     tsbi._branching = SimpleNamespace(
         continue_comparison=lambda _parent, comparison: ("compared", comparison),
-        move=lambda _parent, area: ("moved", area),
+        entry=SimpleNamespace(move=lambda _parent, area: ("moved", area)),
         recheck=lambda _parent: ("rechecked",),
         find_unlinked_overlap=lambda *_: None,
     )

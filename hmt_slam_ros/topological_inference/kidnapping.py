@@ -10,11 +10,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs, uninformative_belief
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, Lost, PoseInArea
@@ -93,14 +90,13 @@ def _keyframes_since(parent: Parent, event: int) -> list[int]:
 
 def _kidnapped_child(branching: Branching, parent: Parent, keyframes: Sequence[int], log_odds: float) -> Child:
     """The child that was kidnapped before the first of some keyframes of its area, which begin a new area."""
-    query = branching.query(parent, keyframes)
+    query = branching.entry.query(parent, keyframes)
     search = branching.search.begin_global_search(parent.hybrid_map, query.poses, keyframes[0])
     search = branching.search.search_now(parent.hybrid_map, search, parent.area, parent.clutter)
     distribution = branching.localize_globally(parent, search).with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
     tracked_pose = PoseInArea(parent.area, keyframes[0], query.belief.mean)
     evidence = log_bayes_factor(parent.hybrid_map, distribution, tracked_pose, query.poses)
-    origin, arc = PoseGaussian.from_pose(np.zeros(3)), uninformative_belief(query.belief.mean)
-    child = branching.enter_area(parent, query, branching.new_area(parent, query), origin, arc, log_odds + evidence)
+    child = branching.entry.enter_unknown(parent, query, log_odds + evidence)
     lost = Lost(keyframes[0], tracked_pose=tracked_pose, counted_evidence=evidence)
     if branching.search.is_conclusive(parent.hybrid_map, search, parent.clutter):
         candidate = decisive_candidate(distribution, query.poses, branching.options)

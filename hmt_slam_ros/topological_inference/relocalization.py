@@ -94,13 +94,12 @@ def _enter_unknown_area(
     branching: Branching, parent: Parent, keyframe: int, initial_pose: InitialPose | None
 ) -> Branches:
     """The only child, in which the robot may be anywhere: in a new area, drawn at the initial pose if there is one."""
-    query = branching.query(parent, [keyframe])
+    query = branching.entry.query(parent, [keyframe])
     hint = None
     if initial_pose is not None and parent.hybrid_map.has_area(initial_pose.area):
         hint = PoseHint(keyframe, initial_pose.area, initial_pose.pose)
-    arc = uninformative_belief(query.belief.mean if hint is None else _hinted_pose(parent, parent.area, hint))
-    origin = PoseGaussian.from_pose(np.zeros(3))
-    child = branching.enter_area(parent, query, branching.new_area(parent, query), origin, arc, 0.0)
+    drawn = None if hint is None else _hinted_pose(parent, parent.area, hint)
+    child = branching.entry.enter_unknown(parent, query, 0.0, drawn)
     before = child.state.localization
     before = before if isinstance(before, Lost) else Lost(keyframe)
     lost = replace(before, since=keyframe, pose_hint=hint, search=None)

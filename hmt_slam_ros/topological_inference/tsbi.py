@@ -301,9 +301,9 @@ class Tsbi:
             and len(self._state.hypothesis_states) == 1
             and parent.hybrid_map.has_area(relocalized_area)
         ):
-            return self._branching.move(parent, relocalized_area)
+            return self._branching.entry.move(parent, relocalized_area)
         if event is not None and event.kind == "moved":
-            return self._branching.move(parent, event.area)
+            return self._branching.entry.move(parent, event.area)
         return Branches([child])
 
     def _branch_on_area_event(self, parent: Parent, event: AreaEvent) -> Branches:
@@ -315,7 +315,7 @@ class Tsbi:
         if parent.state.comparison is not None:
             # Area abstraction repeats the move.
             return self._branching.continue_comparison(parent, parent.state.comparison)
-        return self._branching.move(parent, event.area)
+        return self._branching.entry.move(parent, event.area)
 
     def _branch_without_area_event(self, parent: Parent, estimate: HypothesisEstimate, keyframe: Keyframe) -> Branches:
         """The children in the same area; the robot may be on known ground that no arc leads to."""
@@ -324,7 +324,7 @@ class Tsbi:
         state = replace(parent.state.after_overlap(overlap), localization=lost or Tracking())
         parent = replace(parent, state=state)
         if state.unlinked_overlap is not None and state.unlinked_overlap[1] >= _OVERLAP_PERSISTENCE:
-            return self._branching.link(parent, state.unlinked_overlap[0], keyframe.scan, estimate.pose)
+            return self._branching.entry.link(parent, state.unlinked_overlap[0], keyframe.scan, estimate.pose)
         unmatched = len(state.unmatched_keyframes)
         is_recheck_due = unmatched >= self._options.recheck_keyframes
         if state.comparison is not None:
