@@ -66,6 +66,7 @@ def make_parent(**changes):
 def make_branching(**search):
     branching = Branching(CONFIGURATION, Replica())
     branching.search = SimpleNamespace(**{"work": EventWork(), "tracked_area": lambda *_: None, **search})
+    branching.entry._search = branching.search
     return branching
 
 
@@ -362,7 +363,7 @@ def test_an_overlap_is_joined_by_the_arc_that_the_newest_scan_measures():
     np.testing.assert_allclose(prior.mean, belief.mean)
     np.testing.assert_allclose(prior.covariance, belief.covariance)
     nothing = make_branching(measure_pose=lambda *_: None)
-    assert nothing.link(parent, 2, None, pose).children[0].arcs == ()
+    assert nothing.entry.link(parent, 2, None, pose).children[0].arcs == ()
 
 
 @pytest.mark.parametrize("is_same", [True, False])
