@@ -45,7 +45,7 @@ def test_headings_are_apart_by_half_a_turn_at_most(heading, turn):
         np.testing.assert_allclose(verdict_of(probability, there, elsewhere).ambiguity, expected, atol=1e-9)
 
 
-def test_the_pose_in_the_map_is_as_uncertain_as_the_hypotheses_are_apart_whatever_the_heading():
+def test_poses_in_the_map_and_in_the_area_are_as_uncertain_as_the_hypotheses_are_apart_whatever_the_heading():
     exact = PoseGaussian.from_pose
     apart = np.diag([4.0, 0.0, 0.0])
     estimates = [
@@ -54,6 +54,12 @@ def test_the_pose_in_the_map_is_as_uncertain_as_the_hypotheses_are_apart_whateve
         )
         for turn in (0.0, 0.5 * np.pi)
     ]
-    np.testing.assert_allclose(estimates[0].map_pose.covariance, np.diag([4.0, 0.0, 0.0]), atol=1e-12)
-    np.testing.assert_allclose(estimates[1].map_pose.covariance, np.diag([0.0, 4.0, 0.0]), atol=1e-12)
-    np.testing.assert_allclose(estimates[1].pose_in_area.covariance, 0.0, atol=1e-12)
+    for number, expected in enumerate((apart, np.diag([0.0, 4.0, 0.0]))):
+        for pose in (estimates[number].map_pose, estimates[number].pose_in_area):
+            np.testing.assert_allclose(pose.covariance, expected, atol=1e-12)
+
+
+def test_in_the_frame_of_a_turned_area_hypotheses_are_apart_along_its_own_axes():
+    turned, exact = PoseGaussian.from_pose(np.array([0.0, 0.0, 0.5 * np.pi])), PoseGaussian.from_pose(np.zeros(3))
+    pose = RealTimePose(0, 0, turned, exact, exact, np.zeros(3), np.diag([4.0, 0.0, 0.0])).pose_in_area
+    np.testing.assert_allclose(pose.covariance, np.diag([0.0, 4.0, 0.0]), atol=1e-12)

@@ -295,15 +295,18 @@ class RealTimePose:
     # Computed on demand: an offline run needs none of these poses, and they take most of the time of rtl.
     @cached_property
     def pose_in_area(self) -> PoseGaussian:
-        """Belief over ``area_T_base``, p(s_t+k | s_t, u), the HMT pose by dead reckoning from the last estimate."""
-        return self.estimate.compose(self.motion)
+        """Belief over ``area_T_base``: p(s_t+k | s_t, u), the HMT pose by dead reckoning from the last estimate.
+
+        Its mean is that under the most probable hypothesis, its covariance that over all of them.
+        """
+        pose = self.estimate.compose(self.motion)
+        turn = se2.adjoint((0.0, 0.0, -self.area_pose.mean[2] - pose.mean[2]))
+        return PoseGaussian(pose.mean, pose.covariance + turn @ self.ambiguity @ turn.T)
 
     @cached_property
     def map_pose(self) -> PoseGaussian:
-        """Belief over ``map_T_base``: its mean under the most probable hypothesis, its covariance over all of them."""
-        pose = self.area_pose.compose(self.pose_in_area)
-        turn = se2.adjoint((0.0, 0.0, -pose.mean[2]))
-        return PoseGaussian(pose.mean, pose.covariance + turn @ self.ambiguity @ turn.T)
+        """Belief over ``map_T_base``, likewise."""
+        return self.area_pose.compose(self.pose_in_area)
 
     @property
     def map_T_odom(self) -> Pose:  # noqa: N802  named as every transform is
