@@ -142,7 +142,7 @@ def test_where_nothing_is_known_the_prior_stands(visit, root):
     found = match_areas(visit, blank, prior, SETTINGS)
     assert found.log_evidence == pytest.approx(math.log(chi2.cdf(SETTINGS.gate, 3)), abs=0.03)
     (mode,) = found.modes
-    assert mode.log_mass == found.log_evidence
+    assert mode.log_mass == pytest.approx(found.log_evidence, abs=1e-9)
     np.testing.assert_allclose(mode.pose.mean, prior.mean, atol=0.005)
     floor = np.diag([0.01, 0.01, math.radians(0.2)]) ** 2
     scale = np.sqrt(np.outer(*[np.diag(prior.covariance)] * 2))
@@ -250,3 +250,46 @@ def test_the_same_problem_has_the_same_answer_to_the_bit(known_area, visit):
     first, second = (match_areas(visit, known_area, prior_around(TRUTH, 0.5, 4.0), SETTINGS) for _ in range(2))
     assert first.log_evidence == second.log_evidence
     assert all(np.array_equal(a.pose.mean, b.pose.mean) for a, b in zip(first.modes, second.modes, strict=True))
+
+
+def corridor(pillars, seed):
+    """A mapped corridor along x, and another drive through its middle; with pillars on a side at some x."""
+    sides = [np.array([[-30.0, y, 30.0, y]]) for y in (-1.0, 1.0)]
+    boxes = [box(x - 0.3, 0.7, x + 0.3, 1.2) for x in pillars]
+    walls = np.concatenate(sides + boxes)
+    known = area(walls, poses_along((-6.0, 0.1), (6.0, -0.1), 14, 0.0), seed, beams=181)
+    return known, area(walls, poses_along((-1.0, -0.1), (1.0, 0.2), 4, 0.0), seed + 40, beams=181)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_where_noise_alone_tells_where_along_a_corridor_the_match_is_open_and_pillars_close_it(seed):
+    def deviation(pillars, *, resampled):
+        known, query = corridor(pillars, seed)
+        prior = PoseGaussian(np.array([5.0, 0.0, 0.0]), np.diag([1.5, 0.2, 0.05]) ** 2)
+        result, _ = area_to_area._search(query, known, prior, replace(SETTINGS, temper=0.3))
+        result = area_to_area._resample_surfaces(result) if resampled else result
+        shares = np.exp(result.masses - np.logaddexp.reduce(result.masses))
+        return float(np.sqrt(shares @ (result.poses[:, 0] - shares @ result.poses[:, 0]) ** 2))
+
+    bare, pillars = (), (-2.5, -0.6, 1.1, 2.9)
+    for sides in (bare, pillars):
+        assert deviation(sides, resampled=True) > deviation(sides, resampled=False)
+    assert deviation(pillars, resampled=True) < 0.5 * deviation(bare, resampled=True)
+
+
+def test_resampled_surfaces_keep_the_sum_of_all_masses(visit, known_area):
+    result, _ = area_to_area._search(visit, known_area, prior_around(TRUTH, 0.5, 5.0), SETTINGS)
+    resampled = area_to_area._resample_surfaces(result)
+    assert np.logaddexp.reduce(resampled.masses) == pytest.approx(np.logaddexp.reduce(result.masses))
+    assert np.array_equal(resampled.cells.score, resampled.masses)
+
+
+def test_the_parts_of_stretches_sum_to_the_log_ratio(visit, known_area):
+    fine = LogRatioGrid(known_area.fine_log_ratio, known_area.origin, 0.05)
+    stretches, count = area_to_area._divide_into_stretches(visit.points)
+    parts = match_modes.stretch_log_ratios(fine, visit.points, stretches, count, TRUTH[None])
+    assert parts.shape == (1, count)
+    assert parts.sum() == pytest.approx(match_modes.log_ratio_at(fine, visit.points, TRUTH))
+    for number in range(count):
+        spread = np.ptp(visit.points[stretches == number], axis=0)
+        assert (spread <= 1.0).all()

@@ -42,6 +42,12 @@ _SAME_MODE_GATE = chi_square_gate(0.95)
 _MODES_WORK = 10_000
 """Work for the modes of a match: so many times all samples are looked up, about."""
 
+_STRETCH = 1.0
+"""Edge of the squares into which surfaces are divided to be resampled, m: what one wall, box or door shows there."""
+
+_RESAMPLES = 64
+"""Number of resampled surfaces."""
+
 _MARGIN = 20.0
 """Log-mass below that of the best mode down to which modes are used, nats: the best may be in another area's place."""
 
@@ -134,7 +140,7 @@ def match_areas(
     if result is None:
         return AreaMatch(work=work)
     work += _MODES_WORK * len(query.points)
-    return AreaMatch(float(np.logaddexp.reduce(result.masses)), work, lambda: tuple(_modes(result)))
+    return AreaMatch(float(np.logaddexp.reduce(result.masses)), work, lambda: tuple(_modes(_resample_surfaces(result))))
 
 
 def find_cells(
@@ -290,6 +296,30 @@ def _reachable_points(points: Float64, window: SearchWindow, query: AreaGrid) ->
     radius = np.hypot(corners[:, 0], corners[:, 1]).max() + farthest
     near = np.hypot(points[:, 0] - window.mean[0], points[:, 1] - window.mean[1]) <= radius
     return points[near]
+
+
+def _resample_surfaces(result: _SearchResult) -> _SearchResult:
+    """The result with the mean posterior over resampled surfaces (BayesBag, Huggins and Miller 2023).
+
+    Where a few stretches of wall alone prefer one pose to another, their noise does, and resampling has no preference.
+    A preference that most stretches share, or a niche, stays. The sum of all masses is the same.
+    """
+    problem, cells, masses, poses = result
+    stretches, count = _divide_into_stretches(problem.samples)
+    parts = match_modes.stretch_log_ratios(problem.surface, problem.samples, stretches, count, poses)
+    weights = count * np.random.default_rng(0).dirichlet(np.ones(count), _RESAMPLES)
+    resampled = masses + problem.settings.temper * ((weights - 1.0) @ parts.T)
+    shares = resampled - np.logaddexp.reduce(resampled, axis=1, keepdims=True)
+    mean = np.logaddexp.reduce(shares, axis=0) - math.log(_RESAMPLES)
+    masses = mean + np.logaddexp.reduce(masses)
+    return _SearchResult(problem, cells._replace(score=masses), masses, poses)
+
+
+def _divide_into_stretches(samples: Float64) -> tuple[Int64, int]:
+    """The stretch of every sample, shape (n,), and their number."""
+    squares = np.floor(samples / _STRETCH).astype(np.int64)
+    _, stretches = np.unique(squares, axis=0, return_inverse=True)
+    return stretches.reshape(-1), int(stretches.max()) + 1
 
 
 def _cluster(result: _SearchResult) -> tuple[Int64, Float64]:

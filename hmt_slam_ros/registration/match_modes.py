@@ -125,6 +125,16 @@ def log_ratio_at(surface: LogRatioGrid, samples: Float64, pose: Float64) -> floa
 @njit(cache=True)
 def _log_ratio_at(surface: LogRatioGrid, points: _GridSamples, pose: Float64) -> float:
     """:func:`log_ratio_at` of prepared samples, in two loops: the compiler vectorizes the first."""
+    _locate(surface, points, pose)
+    total = 0.0
+    for n in range(points.x.size):
+        total += _interpolate(surface, points, n)
+    return total
+
+
+@njit(cache=True)
+def _locate(surface: LogRatioGrid, points: _GridSamples, pose: Float64) -> None:
+    """Set the positions of samples in the grid at a pose."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x0, y0 = pose[0] - surface.origin[0], pose[1] - surface.origin[1]
     for n in range(points.x.size):
@@ -133,16 +143,19 @@ def _log_ratio_at(surface: LogRatioGrid, points: _GridSamples, pose: Float64) ->
         left, above = np.floor(u), np.floor(v)
         points.column[n], points.row[n] = np.int32(left), np.int32(above)
         points.right[n], points.down[n] = u - left, v - above
+
+
+@njit(cache=True)
+def _interpolate(surface: LogRatioGrid, points: _GridSamples, n: int) -> float:
+    """The log-ratio at sample n, which is located; 0 beyond the grid."""
     rows, columns = np.uint32(surface.log_ratio.shape[0] - 1), np.uint32(surface.log_ratio.shape[1] - 1)
-    one, total = np.uint32(1), 0.0
-    for n in range(points.x.size):
-        c, r = np.uint32(points.column[n]), np.uint32(points.row[n])
-        if c < columns and r < rows:
-            a, b = points.right[n], points.down[n]
-            low = (1.0 - a) * surface.log_ratio[r, c] + a * surface.log_ratio[r, c + one]
-            high = (1.0 - a) * surface.log_ratio[r + one, c] + a * surface.log_ratio[r + one, c + one]
-            total += (1.0 - b) * low + b * high
-    return total
+    one, c, r = np.uint32(1), np.uint32(points.column[n]), np.uint32(points.row[n])
+    if not (c < columns and r < rows):
+        return 0.0
+    a, b = points.right[n], points.down[n]
+    low = (1.0 - a) * surface.log_ratio[r, c] + a * surface.log_ratio[r, c + one]
+    high = (1.0 - a) * surface.log_ratio[r + one, c] + a * surface.log_ratio[r + one, c + one]
+    return (1.0 - b) * low + b * high
 
 
 @njit(cache=True)
@@ -179,6 +192,22 @@ def integrate_cells(
     fine = _integrate_divided(surface, samples, window, temper, poses[divided], divisions, turn)
     means[divided], poses[divided] = fine[0] + cells.contradiction[divided], fine[1]
     return means, poses
+
+
+@njit(cache=True)
+def stretch_log_ratios(
+    surface: LogRatioGrid, samples: Float64, stretches: Int64, count: int, poses: Float64
+) -> Float64:
+    """The part of every stretch of surface in the log-ratio at poses (c, 3), nats, untempered, shape (c, count).
+
+    :param stretches: shape (n,), the stretch of every sample.
+    """
+    points, parts = _grid_samples(samples), np.zeros((poses.shape[0], count))
+    for n in range(poses.shape[0]):
+        _locate(surface, points, poses[n])
+        for k in range(points.x.size):
+            parts[n, stretches[k]] += _interpolate(surface, points, k)
+    return parts
 
 
 def turn_step(window: SearchWindow) -> float:
