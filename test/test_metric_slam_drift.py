@@ -1,5 +1,7 @@
 """How far off a live hypothesis takes its pose to be in its area's frame."""
 
+import itertools
+
 import numpy as np
 import pytest
 from worlds import drive, scan_in
@@ -32,18 +34,18 @@ class Drive:
         self.truth, self.scans = THERE[0], {}
         self.to(THERE[0])
 
-    def to(self, pose):
+    def to(self, pose, walls=CORRIDOR):
         """Drive to a pose and take a keyframe there; returns its estimate."""
         step = RelativeMotion(se2.between(self.truth, pose), ODOMETRY)
         sequence, self.truth = len(self.scans), pose
-        scan = self.scans[sequence] = scan_in(CORRIDOR, pose, noise=0.01, seed=sequence)
+        scan = self.scans[sequence] = scan_in(walls, pose, noise=0.01, seed=sequence)
         prepared = PreparedScan(self.mapping, scan)
         if sequence:
             self.live.filter.track(prepared, Prediction(step, step, step))
         return self.live.process_keyframe(sequence, prepared, after_reset=sequence == 0)
 
-    def drive_along(self, poses):
-        return [self.to(pose) for pose in poses]
+    def drive_along(self, poses, walls=CORRIDOR):
+        return [self.to(pose, walls) for pose in poses]
 
 
 def deviations(estimate):
@@ -108,3 +110,31 @@ def test_a_robot_that_goes_back_into_an_area_is_as_far_off_as_the_map_there_and_
     live.change_area(hypothesis, content, ParticleFilters(live.filter.mapping))
     assert live.event.pose_covariance[0, 0] == pytest.approx(before[0, 0] + 0.16, rel=0.2)
     assert live.event.pose_covariance[1, 1] < 0.05
+
+
+NOWHERE = np.array([[-200.0, -150.0, 200.0, -150.0]])
+"""A wall out of reach."""
+
+
+def test_a_scan_that_shows_nothing_is_not_stored_and_the_drift_behind_it_counts():
+    drive_ = Drive()
+    drive_.drive_along(THERE[1:3])
+    blind = drive_.drive_along(THERE[3:9], NOWHERE)
+    assert not any(estimate.stored for estimate in blind)
+    assert all(a[0] < b[0] and a[2] < b[2] for a, b in itertools.pairwise(map(deviations, blind)))
+    again = drive_.to(THERE[9])
+    assert again.stored
+    assert deviations(again)[0] == pytest.approx(0.05 * np.sqrt(9), rel=0.15)
+    step = drive_.live.step_covariances[len(drive_.scans) - 1]
+    assert np.sqrt(step[0, 0]) == pytest.approx(0.05 * np.sqrt(7), rel=0.15)
+    np.testing.assert_array_equal(drive_.live.event.blind_drift, np.zeros((3, 3)))
+
+
+def test_the_first_scan_of_a_map_is_stored_whatever_it_shows():
+    mapping = LocalMapping(Configuration())
+    live = LiveHypothesis(ParticleFilter(mapping, 0, 0), Configuration().filter)
+    scan = PreparedScan(mapping, scan_in(NOWHERE, THERE[0]))
+    assert len(scan.surfels) == 0
+    step = RelativeMotion(np.zeros(3), ODOMETRY)
+    live.filter.track(scan, Prediction(step, step, step))
+    assert live.process_keyframe(0, scan).stored

@@ -9,7 +9,7 @@ from hmt_slam_ros.geometry.gaussian import rotate_covariance
 from hmt_slam_ros.sensors import Odometry
 from hmt_slam_ros.sensors.motion_model import Inertia, MotionModel, OdometryNoise
 from hmt_slam_ros.sensors.odometry import OdometryBuffer
-from hmt_slam_ros.sensors.relative_motion import RelativeMotion, increment_covariance, is_wide
+from hmt_slam_ros.sensors.relative_motion import RelativeMotion, has_wide_heading, increment_covariance, is_wide
 
 SECOND = 10**9
 SHARP = np.diag([1e4, 1e4, 1e6])
@@ -288,6 +288,9 @@ def test_a_pose_is_wide_where_its_heading_is_or_its_position_in_all_directions()
         assert is_wide_in(0.01, 0.01, 20.1, theta)
         assert not is_wide_in(0.01, 0.01, 19.9, theta)
         assert is_wide_in(2.0, 0.51, 1.0, theta)
+        for degrees, is_heading_wide in ((20.1, True), (19.9, False)):
+            covariance = np.diag([2.0, 0.51, np.radians(degrees)]) ** 2
+            assert has_wide_heading(covariance, settings) == is_heading_wide
         # A corridor shows where its walls are, and not where along them the robot is.
         assert not is_wide_in(9.0, 0.49, 1.0, theta)
         assert not is_wide_in(0.49, 9.0, 1.0, theta)

@@ -206,8 +206,9 @@ def test_behind_a_wide_arc_the_robot_is_searched_in_the_map_of_before():
     assert lost.counted_evidence is None
     (arc,) = child.arcs
     assert 0.7 < np.sqrt(arc.pose.covariance[2, 2]) < 0.72  # not uninformative
-    _, certain = behind_a_wide_arc((0.1, 0.1, 0.1))
-    assert not certain.state.is_lost
+    for known_heading in ((0.1, 0.1, 0.1), (0.9, 0.9, 0.3)):
+        _, compared = behind_a_wide_arc(known_heading)
+        assert not compared.state.is_lost
 
 
 @pytest.mark.parametrize("is_lost", [False, True])

@@ -60,6 +60,10 @@ class KeyframeCovariances:
         return dict(zip(self.keyframes.tolist(), self.covariances, strict=True))
 
 
+_MIN_SURFELS = 10
+"""Fewest surfels of a scan that a map keeps (docs/decisions/0064-scans-that-show-nothing.md)."""
+
+
 @dataclass(frozen=True, eq=False)
 class LastEvent:
     """The last keyframe event of a hypothesis.
@@ -70,6 +74,7 @@ class LastEvent:
     :ivar motion_error: covariances of that motion.
     :ivar anchor: the stored keyframe to which the poses of later scans are relative.
     :ivar pose_covariance: covariance of the pose in the area's frame, right tangent, shape (3, 3).
+    :ivar blind_drift: drift since the newest keyframe over scans that showed nothing, likewise.
     :ivar contradicted: whether the scan contradicted the submap.
     :ivar recent_scans: scans with which that of the next keyframe is compared, in mode lifelong.
     """
@@ -80,6 +85,7 @@ class LastEvent:
     motion_error: MatchError = _NO_ERROR
     anchor: int = 0
     pose_covariance: Float64 = field(default_factory=_INITIAL_COVARIANCE.copy)
+    blind_drift: Float64 = field(default_factory=lambda: np.zeros((3, 3)))
     contradicted: bool = False
     recent_scans: tuple[RecentScan, ...] = ()
 
@@ -201,9 +207,11 @@ class LiveHypothesis:
             contradicted=evidence.log_kidnapping_ratio > self.settings.contradiction_evidence,
             recent_scans=() if after_reset else self.event.recent_scans,
         )
+        is_first, is_blind = after_reset or not self.filter.keyframes, len(prepared.surfels) < _MIN_SURFELS
+        may_enter = may_store and not is_blind
         # A scan that contradicts may be the first after a displacement.
-        stored = after_reset or (may_store and ((is_informative or self.is_new_viewpoint)() or self.event.contradicted))
-        self._propagate_covariance(sequence if stored else None)
+        stored = is_first or (may_enter and ((is_informative or self.is_new_viewpoint)() or self.event.contradicted))
+        self._propagate_covariance(sequence if stored else None, is_blind=is_blind)
         if stored:
             self.filter.add_keyframe(sequence, prepared.scan)
         self.event = replace(self.event, pose=self.filter.pose, anchor=self._nearest_keyframe())
@@ -239,16 +247,20 @@ class LiveHypothesis:
         relative = se2.between(self.filter.leading_keyframe_poses(), self.filter.pose)
         return not bool(np.any(is_same_viewpoint(relative, self.settings)))
 
-    def _propagate_covariance(self, keyframe: int | None) -> None:
-        """Propagate the drift to the current pose: that of a stored keyframe, or on mapped ground if None."""
-        covariance = self._transported_covariance()
+    def _propagate_covariance(self, keyframe: int | None, *, is_blind: bool) -> None:
+        """Propagate the drift to the current pose: that of a stored keyframe, or on mapped ground if None.
+
+        :param is_blind: whether the scan shows nothing. Unless it is stored, the next stored step has its drift, too.
+        """
+        covariance, step = self._transported_covariance(), self.event.motion_error.drift_covariance
+        blind = PoseGaussian(self.event.pose, self.event.blind_drift).covariance_at(self.filter.pose) + step
         if keyframe is None:
             covariance = self._map_bounded_covariance(covariance)
         else:
-            step = self.event.motion_error.drift_covariance
             covariance = covariance + step
-            self.step_covariances[keyframe], self.keyframe_covariances[keyframe] = step, covariance
-        self.event = replace(self.event, pose_covariance=covariance)
+            self.step_covariances[keyframe], self.keyframe_covariances[keyframe] = blind, covariance
+        blind_drift = blind if is_blind and keyframe is None else np.zeros((3, 3))
+        self.event = replace(self.event, pose_covariance=covariance, blind_drift=blind_drift)
 
     def _transported_covariance(self) -> Float64:
         """The covariance of the last event's pose, shape (3, 3), in the tangent space of the current pose."""

@@ -53,7 +53,13 @@ _SHAPES: Mapping[str, Mapping[str, str]] = {
     "JoinedGraph": {"arc": "3"},
     "KeyframeCovariances": {"keyframes": "n", "covariances": "n 3 3"},
     "Landmark": {"scatter": "3 3", "scan_covariance_share": "3 3"},
-    "LastEvent": {"pose": "3", "motion": "3", "match_information": "3 3", "pose_covariance": "3 3"},
+    "LastEvent": {
+        "pose": "3",
+        "motion": "3",
+        "match_information": "3 3",
+        "pose_covariance": "3 3",
+        "blind_drift": "3 3",
+    },
     "LineFilterState": {
         "reported_poses": "k 3",
         "last_covariance": "3 3",
@@ -188,6 +194,7 @@ _COVARIANCES = frozenset(
         "covariances",
         "pose_covariance",
         "drift_covariance",
+        "blind_drift",
         "last_covariance",
         "tracking_covariance",
         "residual_covariance",

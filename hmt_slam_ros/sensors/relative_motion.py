@@ -134,6 +134,14 @@ def is_wide(covariance: Float64, settings: FilterParameters) -> bool:
 
     :param covariance: shape (3, 3), of the pose in its own frame, m and rad.
     """
-    (xx, xy, _), (_, yy, _), (_, _, turn) = covariance.tolist()
+    (xx, xy, _), (_, yy, _), _ = covariance.tolist()
     least = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)
-    return bool(least > settings.keyframe_distance**2 or turn > math.radians(settings.keyframe_angle) ** 2)
+    return bool(least > settings.keyframe_distance**2) or has_wide_heading(covariance, settings)
+
+
+def has_wide_heading(covariance: Float64, settings: FilterParameters) -> bool:
+    """Whether a heading is less certain than those of keyframes at one place differ.
+
+    :param covariance: shape (3, 3), of a pose, m and rad.
+    """
+    return bool(covariance[2, 2] > math.radians(settings.keyframe_angle) ** 2)

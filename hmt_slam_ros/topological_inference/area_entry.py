@@ -16,7 +16,7 @@ from hmt_slam_ros.hybrid_map.shortest_path import informative_arc, shortest_path
 from hmt_slam_ros.messages.map_changes import Arc, MovedKeyframe
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.relative_motion import is_wide
+from hmt_slam_ros.sensors.relative_motion import has_wide_heading
 from hmt_slam_ros.topological_inference.area_comparison import Fit, OngoingComparison
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.candidate_gating import Query
@@ -75,8 +75,8 @@ class AreaEntry:
         """New ground: the reference keyframe becomes the frame of a new area."""
         origin = PoseGaussian.from_pose(np.zeros(3))
         child = self.enter_area(parent, query, self.new_area(parent, query), origin, query.belief, log_factor)
-        # Behind so wide an arc, gates admit all places, and a search of the whole map costs less than comparisons.
-        is_lost = not child.state.is_lost and is_wide(query.belief.covariance, self._filter)
+        # With any heading, gates admit all places, and a search of the whole map costs less than comparisons.
+        is_lost = not child.state.is_lost and has_wide_heading(query.belief.covariance, self._filter)
         return lose(child, parent, query) if is_lost else child
 
     def enter_meanwhile(self, parent: Parent, query: Query, comparison: OngoingComparison) -> Child:
