@@ -12,6 +12,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import MovedKeyframe
 from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis
+from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import Prediction
 from hmt_slam_ros.sensors.relative_motion import RelativeMotion
 from hmt_slam_ros.submap.local_filter import PlacedKeyframe
@@ -138,3 +139,13 @@ def test_the_first_scan_of_a_map_is_stored_whatever_it_shows():
     step = RelativeMotion(np.zeros(3), ODOMETRY)
     live.filter.track(scan, Prediction(step, step, step))
     assert live.process_keyframe(0, scan).stored
+
+
+@pytest.mark.parametrize(
+    ("beams", "hits", "is_blind"), [(180, 8, True), (180, 9, False), (1080, 54, False), (16, 1, False)]
+)
+def test_how_many_beams_a_keyframe_needs_goes_by_how_many_there_are(beams, hits, is_blind):
+    ranges = np.full(beams, np.inf, np.float32)
+    ranges[: hits * max(1, beams // 180)] = 5.0
+    scan = Scan(0, ranges, -0.5 * np.pi, np.pi / beams, 0.02, 30.0, np.zeros(3))
+    assert PreparedScan(LocalMapping(Configuration()), scan).is_blind == is_blind

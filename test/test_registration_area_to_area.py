@@ -277,11 +277,14 @@ def test_where_noise_alone_tells_where_along_a_corridor_the_match_is_open_and_pi
     assert deviation(pillars, resampled=True) < 0.5 * deviation(bare, resampled=True)
 
 
-def test_resampled_surfaces_keep_the_sum_of_all_masses(visit, known_area):
+@pytest.mark.parametrize("most", [20, 2000])
+def test_resampled_surfaces_keep_the_sum_of_all_masses(visit, known_area, most, monkeypatch):
+    monkeypatch.setattr(area_to_area, "_RESAMPLED_CELLS", most)
     result, _ = area_to_area._search(visit, known_area, prior_around(TRUTH, 0.5, 5.0), SETTINGS)
     resampled = area_to_area._resample_surfaces(result)
     assert np.logaddexp.reduce(resampled.masses) == pytest.approx(np.logaddexp.reduce(result.masses))
     assert np.array_equal(resampled.cells.score, resampled.masses)
+    assert (resampled.masses != result.masses).sum() == min(most, len(result.masses))
 
 
 def test_the_parts_of_stretches_sum_to_the_log_ratio(visit, known_area):

@@ -60,10 +60,6 @@ class KeyframeCovariances:
         return dict(zip(self.keyframes.tolist(), self.covariances, strict=True))
 
 
-_MIN_SURFELS = 10
-"""Fewest surfels of a scan that a map keeps (docs/decisions/0064-scans-that-show-nothing.md)."""
-
-
 @dataclass(frozen=True, eq=False)
 class LastEvent:
     """The last keyframe event of a hypothesis.
@@ -207,7 +203,7 @@ class LiveHypothesis:
             contradicted=evidence.log_kidnapping_ratio > self.settings.contradiction_evidence,
             recent_scans=() if after_reset else self.event.recent_scans,
         )
-        is_first, is_blind = after_reset or not self.filter.keyframes, len(prepared.surfels) < _MIN_SURFELS
+        is_first, is_blind = after_reset or not self.filter.keyframes, prepared.is_blind
         may_enter = may_store and not is_blind
         # A scan that contradicts may be the first after a displacement.
         stored = is_first or (may_enter and ((is_informative or self.is_new_viewpoint)() or self.event.contradicted))

@@ -48,6 +48,9 @@ _STRETCH = 1.0
 _RESAMPLES = 64
 """Number of resampled surfaces."""
 
+_RESAMPLED_CELLS = 2000
+"""Cells of a search whose masses are resampled, the heaviest, so that the work is bounded."""
+
 _MARGIN = 20.0
 """Log-mass below that of the best mode down to which modes are used, nats: the best may be in another area's place."""
 
@@ -305,13 +308,16 @@ def _resample_surfaces(result: _SearchResult) -> _SearchResult:
     A preference that most stretches share, or a niche, stays. The sum of all masses is the same.
     """
     problem, cells, masses, poses = result
+    heaviest = np.sort(np.argsort(-masses, kind="stable")[:_RESAMPLED_CELLS])
     stretches, count = _divide_into_stretches(problem.samples)
-    parts = match_modes.stretch_log_ratios(problem.surface, problem.samples, stretches, count, poses)
+    parts = match_modes.stretch_log_ratios(problem.surface, problem.samples, stretches, count, poses[heaviest])
     weights = count * np.random.default_rng(0).dirichlet(np.ones(count), _RESAMPLES)
-    resampled = masses + problem.settings.temper * ((weights - 1.0) @ parts.T)
+    resampled = masses[heaviest] + problem.settings.temper * ((weights - 1.0) @ parts.T)
     shares = resampled - np.logaddexp.reduce(resampled, axis=1, keepdims=True)
     mean = np.logaddexp.reduce(shares, axis=0) - math.log(_RESAMPLES)
-    masses = mean + np.logaddexp.reduce(masses)
+    total = np.logaddexp.reduce(masses[heaviest])
+    masses = masses.copy()
+    masses[heaviest] = mean + total
     return _SearchResult(problem, cells._replace(score=masses), masses, poses)
 
 

@@ -66,6 +66,9 @@ _AMBIGUOUS = 3.0
 _GATE = chi_square_gate(0.999)
 """Squared Mahalanobis distance up to which odometry agrees with a match; 3 degrees of freedom."""
 
+_MIN_SURFEL_SHARE = 0.05
+"""Smallest share of the beams that end on surfaces in a keyframe (docs/decisions/0064-scans-that-show-nothing.md)."""
+
 T = TypeVar("T")
 
 
@@ -142,6 +145,12 @@ class PreparedScan:
     def surfels(self) -> Float64:
         """Surfels for matching with a grid, shape (n, 4), base frame."""
         return self._mapping.matching_surfels(self.scan)
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether the scan shows too few surfaces to be a keyframe."""
+        beams = min(self.scan.ranges.size, self._mapping.configuration.matching.max_points)
+        return len(self.surfels) < _MIN_SURFEL_SHARE * beams
 
     def derive(self, make: Callable[[Scan, Configuration], T]) -> T:
         """The value that a function derives from the scan."""
