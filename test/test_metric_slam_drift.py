@@ -33,9 +33,9 @@ class Drive:
         self.mapping = LocalMapping(configuration)
         self.live = LiveHypothesis(ParticleFilter(self.mapping, 0, 0), configuration.filter)
         self.truth, self.scans = THERE[0], {}
-        self.to(THERE[0])
+        self.drive_to(THERE[0])
 
-    def to(self, pose, walls=CORRIDOR):
+    def drive_to(self, pose, walls=CORRIDOR):
         """Drive to a pose and take a keyframe there; returns its estimate."""
         step = RelativeMotion(se2.between(self.truth, pose), ODOMETRY)
         sequence, self.truth = len(self.scans), pose
@@ -46,7 +46,7 @@ class Drive:
         return self.live.process_keyframe(sequence, prepared, after_reset=sequence == 0)
 
     def drive_along(self, poses, walls=CORRIDOR):
-        return [self.to(pose, walls) for pose in poses]
+        return [self.drive_to(pose, walls) for pose in poses]
 
 
 def deviations(estimate):
@@ -123,7 +123,7 @@ def test_a_scan_that_shows_nothing_is_not_stored_and_the_drift_behind_it_counts(
     blind = drive_.drive_along(THERE[3:9], NOWHERE)
     assert not any(estimate.stored for estimate in blind)
     assert all(a[0] < b[0] and a[2] < b[2] for a, b in itertools.pairwise(map(deviations, blind)))
-    again = drive_.to(THERE[9])
+    again = drive_.drive_to(THERE[9])
     assert again.stored
     assert deviations(again)[0] == pytest.approx(0.05 * np.sqrt(9), rel=0.15)
     step = drive_.live.step_covariances[len(drive_.scans) - 1]
