@@ -74,7 +74,7 @@ def make_tsbi():
     tsbi._branching = SimpleNamespace(
         continue_comparison=lambda _parent, comparison: ("compared", comparison),
         entry=SimpleNamespace(move=lambda _parent, area: ("moved", area)),
-        recheck=lambda _parent: ("rechecked",),
+        recheck=lambda _parent, *areas: ("rechecked", *areas),
         find_unlinked_overlap=lambda *_: None,
     )
     return tsbi
@@ -114,3 +114,15 @@ def test_a_search_and_a_comparison_of_a_lost_hypothesis_take_turns(monkeypatch, 
     assert answers == ["compared", ["searched"], *["compared"] * 4]
     unmatched = make_parent(unmatched_keyframes=tuple(range(9)))
     assert tsbi._branch_without_area_event(unmatched, estimate, keyframe) == ("rechecked",)
+
+
+def test_keyframes_that_fitted_beside_an_area_are_compared_with_it_once():
+    """At an event without a new keyframe, as in a hall, a comparison would have the same result."""
+    tsbi, keyframe = make_tsbi(), SimpleNamespace(sequence=20, mapping=True)
+    parent = make_parent(unmatched_keyframes=(4, 5, 6), pending_candidates=(2,))
+    stored, unstored = (
+        SimpleNamespace(pose=SimpleNamespace(mean=np.zeros(3)), stored=is_stored) for is_stored in (True, False)
+    )
+    assert tsbi._branch_without_area_event(parent, stored, keyframe) == ("rechecked", (2,))
+    (stay,) = tsbi._branch_without_area_event(parent, unstored, keyframe).children
+    assert stay.state.pending_candidates == (2,)

@@ -42,6 +42,7 @@ from hmt_slam_ros.topological_inference.candidate_gating import (
     CandidateGating,
     EntryPrior,
     Query,
+    consistent_share,
     entry_prior,
     transition_model,
 )
@@ -303,7 +304,8 @@ class ClosureSearch:
         if modes is not None:
             points = self._grid_cache.grid(candidate.unmatched_poses).points
             agreements = tuple(place.grid.compare(points, mode.pose.mean) for mode in modes)
-            examined = examined._replace(modes=tuple(modes), agreements=agreements)
+            consistent = self._consistent_share(place, candidate) if modes else 1.0
+            examined = examined._replace(modes=tuple(modes), agreements=agreements, consistent=consistent)
         candidates = {area: c for area, c in comparison.candidates.items() if area != known}
         return replace(comparison, candidates=candidates, examined=(*comparison.examined, examined), prepared=None)
 
@@ -321,7 +323,8 @@ class ClosureSearch:
         """Prior and evidence of all areas that were examined."""
         examined = [one for one in comparison.examined if one.entry.probability > 0.0]
         priors = {one.area: one.entry.probability for one in examined}
-        transition = transition_model(priors | dict(comparison.skipped), self._options.new_probability)
+        consistent = min((one.consistent for one in examined), default=1.0)
+        transition = transition_model(priors | dict(comparison.skipped), self._options.new_probability, consistent)
         newest = max(comparison.query.poses)
         if priors and newest != self._newest_sampled:
             self._newest_sampled = newest
@@ -432,6 +435,12 @@ class ClosureSearch:
     def _entry_probability(self, place: AreaPlace, candidate: AreaCandidate) -> EntryPrior:
         return entry_prior(place, candidate.prior, stack_poses(candidate.unmatched_poses), self._options.place_radius)
 
+    def _consistent_share(self, place: AreaPlace, candidate: AreaCandidate) -> float:
+        query, poses = self._grid_cache.grid(candidate.unmatched_poses), stack_poses(candidate.unmatched_poses)
+        share, work = consistent_share(place, query, candidate.prior, poses, self._options.place_radius)
+        self.work.add(work)
+        return share
+
     def _negative_sample(self, hybrid_map: HybridMap, area: int, excluded: Collection[int]) -> NegativeSample:
         """An area's grid, and the pose of its middle keyframe."""
         poses = stack_poses(hybrid_map.keyframes(area))
@@ -466,7 +475,7 @@ class ClosureSearch:
 
         :param pi: prior of the place in the transition model, beside that by itself.
         """
-        area, prior, entry, modes, agreements, _ = examined
+        area, prior, entry, modes, agreements = examined[:5]
         is_expected = entry.probability > 0.5 and bool(hybrid_map.pending_closures)
         log_total_mass = float(np.logaddexp.reduce([mode.log_mass for mode in modes]) if modes else 0.0)
         for mode, agreement in zip(modes, agreements, strict=True):

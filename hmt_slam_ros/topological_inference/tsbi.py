@@ -337,7 +337,7 @@ class Tsbi:
             return self._branching.continue_comparison(parent, state.comparison)
         if is_recheck_due:
             return self._branching.recheck(parent)
-        if state.pending_candidates and unmatched == _RETRY_KEYFRAMES:
+        if estimate.stored and state.pending_candidates and unmatched == _RETRY_KEYFRAMES:
             return self._branching.recheck(parent, state.pending_candidates)
         return Branches([parent.unchanged_child()])
 
