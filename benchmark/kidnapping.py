@@ -28,6 +28,7 @@ from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 WORLDS = ("office", "busy", "nested", "hall", "ring")
 LOGS = ("aces", "intel")
@@ -39,9 +40,6 @@ SEEDS = 10
 
 SOON, SHARE = 5.0, 0.95
 """Path within which a kidnapping has to be detected, m, and smallest share of the cases."""
-
-SURE, LOST_LIMIT = 0.9, 0.1
-"""Smallest probability of the place of a sure robot, and largest one of being lost of a localized robot."""
 
 _RIGHT, _RIGHT_ANGLE, _DRIFT = 0.5, math.radians(10.0), 0.03
 _DRAWS = 2009
@@ -56,8 +54,8 @@ POLICY = (
     "Two rounds of each world. The robot is kidnapped once, without odometry, and turned by up to 180 degrees: in the "
     f"second round to another part of it (known), in the first one to unmapped ground (unknown), or {_STEP:g} m "
     f"farther on its route (short); or as in known, with {_GAP:g} s without scans (gap). "
-    "The kidnapping is noticed when the robot is not localized, or right. The robot is "
-    f"sure if hypotheses that are not lost have a probability of {SURE:g}. It is right within {_RIGHT:g} m and "
+    "The kidnapping is noticed when the robot is not localized, or right. A robot is sure while hmt/is_localized "
+    f"says so. It is right within {_RIGHT:g} m and "
     f"{math.degrees(_RIGHT_ANGLE):.0f} degrees of the pose by the nearest keyframe of before, with {100 * _DRIFT:g} % "
     "of the distance to that added. Errors are those of metric SLAM's trajectory at relations within the parts before "
     "and after. False alarms are meters on which a robot that was not kidnapped is not localized. In hall and ring the "
@@ -105,14 +103,12 @@ class LocalizationReport(NamedTuple):
     """The localization of a robot at a keyframe event.
 
     :ivar traveled: path since the kidnapping, m.
-    :ivar localized: whether lost hypotheses have a probability of ``LOST_LIMIT`` at most.
-    :ivar is_sure: whether hypotheses that are not lost have the probability ``SURE``.
+    :ivar localized: as ``hmt/is_localized``.
     :ivar is_right: whether its estimate is right.
     """
 
     traveled: float
     localized: bool
-    is_sure: bool
     is_right: bool
 
 
@@ -136,18 +132,11 @@ class MonitoredRun:
         """Number of keyframe events."""
         return len(self.run.recorder.keyframes)
 
-    def lost_probability(self) -> float:
-        """Probability of the lost hypotheses."""
-        hypotheses = self.run.recorder.hypotheses
-        return sum(hypothesis.probability for hypothesis in hypotheses[max(hypotheses)].hypotheses if hypothesis.lost)
-
-    def is_sure(self) -> bool:
-        """Whether hypotheses that are not lost have the probability ``SURE``."""
-        hypotheses = self.run.recorder.hypotheses
-        return (
-            sum(hypothesis.probability for hypothesis in hypotheses[max(hypotheses)].hypotheses if not hypothesis.lost)
-            >= SURE
-        )
+    def is_localized(self) -> bool:
+        """As ``hmt/is_localized``."""
+        tsbi = self.run.lock_step.processes["tsbi"]
+        assert isinstance(tsbi, Tsbi)
+        return tsbi.localization.localized
 
     def is_right(self, true: NDArray[np.float64]) -> bool:
         """Whether the last estimate agrees with the map of before the kidnapping.
@@ -195,7 +184,7 @@ class MonitoredRun:
         if not new or self.kidnap_event < 0:
             return None
         true = self.true[self.events - 1]
-        return LocalizationReport(traveled, self.lost_probability() <= LOST_LIMIT, self.is_sure(), self.is_right(true))
+        return LocalizationReport(traveled, self.is_localized(), self.is_right(true))
 
 
 def leave_gap(records: Iterable[LogRecord], seconds: float) -> Iterator[LogRecord]:
@@ -258,16 +247,16 @@ def summarize_drive(reports: Sequence[LocalizationReport], errors: tuple[float, 
     noticed = next((report.traveled for report in reports if not report.localized or report.is_right), math.inf)
     again = math.inf
     for report in reversed(reports):
-        if not (report.is_sure and report.is_right):
+        if not (report.localized and report.is_right):
             break
         again = report.traveled
     wrong = [
         later.traveled - report.traveled
         for report, later in pairwise(reports)
-        if report.traveled > noticed and report.is_sure and not report.is_right
+        if report.traveled > noticed and report.localized and not report.is_right
     ]
     last = reports[-1]
-    return Kidnapping(noticed, again, sum(wrong), last.is_sure and not last.is_right, errors, traveled)
+    return Kidnapping(noticed, again, sum(wrong), last.localized and not last.is_right, errors, traveled)
 
 
 def _error(own: StampedPoses, truth: StampedPoses, chosen: NDArray[np.bool_]) -> float:
@@ -296,7 +285,7 @@ def drive_ordinary(path: Path | str, changes: Sequence[str] = ()) -> OrdinaryDri
         monitored.run.process_record(record)
         if monitored.events > before:
             traveled = monitored.run.recorder.keyframes[monitored.events - 1].path_length
-            unsure += (traveled - driven) * (monitored.lost_probability() > LOST_LIMIT)
+            unsure += (traveled - driven) * (not monitored.is_localized())
             driven = traveled
     return OrdinaryDrive(driven, unsure)
 

@@ -18,7 +18,7 @@ from benchmark.kidnapping import (
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Scan
 
-LOST, RIGHT, WRONG = (False, False, False), (True, True, True), (True, True, False)
+LOST, RIGHT, WRONG = (False, False), (True, True), (True, False)
 
 
 def summarize(*states):

@@ -9,11 +9,15 @@ import pytest
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.registration.area_to_area import MatchMode
-from hmt_slam_ros.registration.consistency import MAP_IN_MAP, MAPS_OUTLIER_RATE, Agreement
+from hmt_slam_ros.registration.consistency import MAP_IN_MAP, MAPS_OUTLIER_RATE, SCAN_IN_STORED_MAP, Agreement
 from hmt_slam_ros.topological_inference.area_comparison import ExaminedArea
+from hmt_slam_ros.topological_inference.branches import Parent
+from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.candidate_gating import EntryPrior
-from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, first_new_keyframe
+from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
 from hmt_slam_ros.topological_inference.place_recognition import (
     PerceptualAliasing,
     ScanDescriptors,
@@ -70,14 +74,38 @@ def test_a_match_is_as_distinctive_as_as_good_ones_elsewhere_are_rare():
 
 
 def test_known_ground_is_that_of_keyframes_older_than_thirty_events_in_steps_of_twenty():
+    for keyframe, before in ((29, -20), (30, 0), (49, 0), (50, 20), (69, 20), (70, 40)):
+        assert first_new_keyframe(keyframe) == before
+
+
+def test_what_contradicts_known_ground_counts_less_among_clutter():
     search, requested = ClosureSearch(Configuration(), {}), []
     points, pose = np.zeros((3, 2)), np.array([1.0, 2.0, 0.3])
-    grid = SimpleNamespace(compare=lambda *given: requested.append(given) or Agreement(0, 0, 0))
+    grid = SimpleNamespace(compare=lambda *given: requested.append(given) or Agreement(100, 80, 20))
     search._grid_cache = SimpleNamespace(grid_before=lambda _map, _poses, before: requested.append(before) or grid)
-    for keyframe, before in ((29, -20), (30, 0), (49, 0), (50, 20), (69, 20), (70, 40)):
-        assert search.known_ground_log_ratio(HybridMap(), {}, points, pose, keyframe) == 0.0
-        assert requested[-2] == before
-        assert requested[-1] == (points, pose)
+    found = [search.known_ground_log_ratio(HybridMap(), {}, points, pose, 20, clutter) for clutter in (0.0, 0.002, 0.1)]
+    assert requested[:2] == [20, (points, pose)]
+    expected = [
+        SCAN_IN_STORED_MAP.log_likelihood_ratio(Agreement(100, 80, 20), rate)
+        for rate in (MAPS_OUTLIER_RATE, MAPS_OUTLIER_RATE, 0.1)
+    ]
+    assert found == pytest.approx(expected)
+    assert found[2] > found[0] + 1.0
+
+
+@pytest.mark.parametrize(("agreement", "counts"), [(Agreement(100, 100, 0), True), (Agreement(100, 50, 50), False)])
+def test_after_a_kidnapping_known_ground_is_what_was_known_before_and_counts_where_it_agrees(agreement, counts):
+    branching, before = Branching(Configuration(), Replica()), []
+    grid = SimpleNamespace(compare=lambda *_: agreement)
+    branching.search._grid_cache = SimpleNamespace(grid_before=lambda _map, _poses, k: before.append(k) or grid)
+    parent = Parent(0, 0, HybridMap(), HypothesisState(), -1.5)
+    ratio = SCAN_IN_STORED_MAP.log_likelihood_ratio(agreement, MAPS_OUTLIER_RATE)
+    points, pose = np.zeros((3, 2)), np.zeros(3)
+    usual = branching.reweight_by_known_ground(parent, pose, points, 95).log_weight
+    kidnapped = branching.reweight_by_known_ground(parent, pose, points, 95, 77).log_weight
+    assert before == [60, 77]
+    assert usual == pytest.approx(-1.5 + ratio)
+    assert kidnapped == pytest.approx(-1.5 + (ratio if counts else 0.0))
 
 
 @pytest.mark.parametrize("count", [1, 31, 32, 100])

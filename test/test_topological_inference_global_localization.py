@@ -90,6 +90,8 @@ def test_the_entropy_is_that_of_the_areas_of_tracked_and_lost_robots(tracked, li
 
 def test_a_robot_in_one_area_for_certain_is_localized_without_entropy():
     assert summarize_localization({3: 1.0}, 0.0, 0.0, 5, None, 0.1) == (True, 0.0)
+    assert not summarize_localization({3: 1.0}, 0.06, 0.0, 5, None, 0.1, 0.05).localized
+    assert summarize_localization({3: 1.0}, 0.05, 0.0, 5, None, 0.1, 0.04).localized
     half = summarize_localization({3: 0.5}, 0.0, 0.5, 5, None, 0.1)
     assert half.entropy == pytest.approx(math.log(2.0))
 

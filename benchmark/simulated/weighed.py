@@ -176,9 +176,11 @@ class _WeighedBranching(ObservedBranching):
         super().begin_event()
         self.known_ground = {}
 
-    def reweight_by_known_ground(self, parent: Parent, pose: Float64, points: Float64, keyframe: int) -> Parent:
+    def reweight_by_known_ground(
+        self, parent: Parent, pose: Float64, points: Float64, keyframe: int, kidnapped: int | None = None
+    ) -> Parent:
         """As of the base class, weighed."""
-        log_weight = super().reweight_by_known_ground(parent, pose, points, keyframe).log_weight
+        log_weight = super().reweight_by_known_ground(parent, pose, points, keyframe, kidnapped).log_weight
         self.known_ground[parent.hypothesis] = log_evidence = log_weight - parent.log_weight
         return replace(parent, log_weight=parent.log_weight + self._weight * log_evidence)
 

@@ -115,7 +115,11 @@ class InferenceParameters:
         0.7, "Share of the surfaces that have to be known where a kidnapped robot relocalizes.", 0.0, 1.0, expert=True
     )
     lost_probability: float = parameter(
-        0.1, "The robot counts as localized up to this probability of lost hypotheses.", 0.0, 0.5, expert=True
+        0.1,
+        "The robot counts as localized up to this probability of being lost, or elsewhere than it is reported.",
+        0.0,
+        0.5,
+        expert=True,
     )
 
 

@@ -35,7 +35,7 @@ from hmt_slam_ros.topological_inference.area_comparison import (
 from hmt_slam_ros.topological_inference.area_entry import AreaEntry, lose
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.candidate_gating import Query
-from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, SearchState
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, SearchState, first_new_keyframe
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, LandmarkEvidence, PoseHint
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     Lost,
@@ -174,15 +174,26 @@ class Branching:
         self.entry.begin_event()
         self.search.work.begin_event()
 
-    def reweight_by_known_ground(self, parent: Parent, pose: Float64, points: Float64, keyframe: int) -> Parent:
+    def reweight_by_known_ground(
+        self, parent: Parent, pose: Float64, points: Float64, keyframe: int, kidnapped: int | None = None
+    ) -> Parent:
         """The hypothesis with the evidence of the newest scan for the known ground around it.
+
+        After a kidnapping known ground is all from before, and counts where the scan agrees with it: contradictions
+        count by the submap, beams and walls.
 
         :param points: the scan's surface points, shape (n, 2), m, base frame.
         :param pose: ``area_T_base`` of the scan.
         :param keyframe: its number.
+        :param kidnapped: the first keyframe after a kidnapping under one of the hypotheses.
         """
         poses = {parent.area: np.zeros(3), **parent.local_area_poses()}
-        log_ratio = self.search.known_ground_log_ratio(parent.hybrid_map, poses, points, pose, keyframe)
+        before = first_new_keyframe(keyframe) if kidnapped is None else kidnapped
+        log_ratio = self.search.known_ground_log_ratio(
+            parent.hybrid_map, poses, points, pose, before, parent.clutter.beam_outlier_rate
+        )
+        if kidnapped is not None:
+            log_ratio = max(0.0, log_ratio)
         return replace(parent, log_weight=parent.log_weight + log_ratio)
 
     def cut(self, parent: Parent, keyframes: Sequence[int]) -> Branches:

@@ -211,18 +211,25 @@ class ClosureSearch:
         return surface_points(scan, self._model)
 
     def known_ground_log_ratio(
-        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], points: Float64, pose: Pose, keyframe: int
+        self,
+        hybrid_map: HybridMap,
+        poses: Mapping[int, Pose],
+        points: Float64,
+        pose: Pose,
+        before: int,
+        clutter: float = 0.0,
     ) -> float:
-        """log p(scan | the robot is there) / p(scan | it is in a similar place), by old keyframes, nats.
+        """log p(scan | the robot is there) / p(scan | it is in a similar place), by the keyframes before one, nats.
 
         :param poses: {area: ``area_T_other``} of the areas that the robot is in or beside.
         :param points: of :meth:`surface_points`.
         :param pose: ``area_T_base`` of the scan.
-        :param keyframe: the newest.
+        :param before: of :func:`first_new_keyframe`, or the first one after a kidnapping.
+        :param clutter: usual rate of beams that contradict the robot's map, where that is above the rate of maps.
         """
-        before = (keyframe - _OLD_EVENTS) // _OLD_STEP * _OLD_STEP
         grid = self._grid_cache.grid_before(hybrid_map, poses, before)
-        return SCAN_IN_STORED_MAP.log_likelihood_ratio(grid.compare(points, pose), MAPS_OUTLIER_RATE)
+        rate = max(MAPS_OUTLIER_RATE, clutter)
+        return SCAN_IN_STORED_MAP.log_likelihood_ratio(grid.compare(points, pose), rate)
 
     def begin_comparison(
         self,
@@ -486,6 +493,11 @@ class ClosureSearch:
             log_offset = -0.5 * max(0.0, distance - entry.median_mahalanobis2)
             log_weight = math.log(pi) + mode.log_mass - log_total_mass + log_evidence + log_offset
             yield Fit(area, mode, log_weight)
+
+
+def first_new_keyframe(keyframe: int) -> int:
+    """The first keyframe that is no known ground yet when ``keyframe`` is the newest."""
+    return (keyframe - _OLD_EVENTS) // _OLD_STEP * _OLD_STEP
 
 
 def _split_heaviest(fits: Sequence[Fit], count: int) -> tuple[tuple[Fit, ...], tuple[Fit, ...]]:

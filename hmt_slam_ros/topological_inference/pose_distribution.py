@@ -70,7 +70,7 @@ class PoseDistribution(NamedTuple):
 class LocalizationStatus(NamedTuple):
     """Whether the robot is localized.
 
-    :ivar localized: whether the lost hypotheses are improbable.
+    :ivar localized: whether the hypotheses are improbable under which it is lost, or elsewhere.
     :ivar entropy: of the belief over the robot's area, nats; 0 where it is certain.
     """
 
@@ -85,6 +85,7 @@ def summarize_localization(
     known: int,
     distribution: PoseDistribution | None,
     max_lost_probability: float,
+    elsewhere: float = 0.0,
 ) -> LocalizationStatus:
     """The localization status of all hypotheses together.
 
@@ -93,13 +94,16 @@ def summarize_localization(
     :param unexamined: probability that no hypothesis is right.
     :param known: number of areas in which a lost robot can be.
     :param distribution: of the pose of a lost robot; None before the first search.
-    :param max_lost_probability: largest probability of the lost hypotheses of a localized robot.
+    :param max_lost_probability: largest probability of the lost hypotheses of a localized robot, and of those under
+        which it is elsewhere.
+    :param elsewhere: probability of tracked hypotheses under which the robot is in another place than under the most
+        probable one.
     """
     lost_areas = [lost * probability for probability in _lost_distribution(known, distribution)]
     probabilities = np.array([*area_probabilities.values(), *lost_areas, unexamined])
     probabilities = probabilities[probabilities > 0.0]
     entropy = abs(float(probabilities @ np.log(probabilities)))
-    return LocalizationStatus(lost <= max_lost_probability, entropy)
+    return LocalizationStatus(lost + elsewhere <= max_lost_probability, entropy)
 
 
 def _lost_distribution(known: int, distribution: PoseDistribution | None) -> list[float]:

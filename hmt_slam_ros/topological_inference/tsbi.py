@@ -12,6 +12,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.surroundings import areas_around, consistent_pose
 from hmt_slam_ros.messages.map_changes import AreaPose, LocalArea
 from hmt_slam_ros.messages.messages import (
@@ -29,15 +30,18 @@ from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, GlobalPoses, Replica
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.branching import Branching, BranchingState
+from hmt_slam_ros.topological_inference.hypothesis_agreement import (
+    LocalizedHypothesis,
+    elsewhere_probability,
+    merge_equivalent,
+)
 from hmt_slam_ros.topological_inference.hypothesis_changes import apply_revision, merge_areas
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     HypothesisState,
-    LocalizedHypothesis,
     Lost,
     PoseInArea,
     ReducedDistribution,
     Tracking,
-    merge_equivalent,
     normalize_and_reduce,
 )
 from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
@@ -117,7 +121,8 @@ class Tsbi:
         self._state = replace(state, replica=ReplicaState(), branching=BranchingState())
         self._keyframe: Keyframe | None = None
         self._estimates: dict[int, HypothesisEstimate] = {}
-        # Not part of the state, since the next search computes them again.
+        # Not part of the state, since the next event computes them again, or the next search.
+        self._robot_poses: dict[int, Float64] = {}
         self._reset_event = -1
         self._pose_distribution: PoseDistribution | None = None
 
@@ -131,12 +136,13 @@ class Tsbi:
         """Whether the robot is localized, and the entropy of the belief over its area."""
         is_reset = (-1 if self._keyframe is None else self._keyframe.sequence) < self._reset_event
         states = self._state.hypothesis_states
-        areas, lost = defaultdict[int, float](float), 0.0
+        areas, lost, tracked = defaultdict[int, float](float), 0.0, list[int]()
         for hypothesis, probability in self._replica.probabilities.items():
             if is_reset or states[hypothesis].is_lost:
                 lost += probability
             else:
                 areas[self._replica.robot_areas[hypothesis]] += probability
+                tracked.append(hypothesis)
         best = self._replica.best_hypothesis
         localization, hybrid_map = states[best].localization, self._replica.maps[best]
         since = self._reset_event if is_reset else localization.since if isinstance(localization, Lost) else None
@@ -145,7 +151,21 @@ class Tsbi:
         )
         distribution = None if is_reset else self._pose_distribution
         allowed = self._options.lost_probability
-        return summarize_localization(areas, lost, self._state.unexamined, known, distribution, allowed)
+        elsewhere = 0.0 if lost > allowed else self._elsewhere_probability(tracked, allowed)
+        return summarize_localization(areas, lost, self._state.unexamined, known, distribution, allowed, elsewhere)
+
+    def _elsewhere_probability(self, tracked: Sequence[int], allowed: float) -> float:
+        """The probability that the robot is elsewhere than the most probable of some hypotheses has it.
+
+        :param allowed: where those that are less probable have no more together, they are not compared: 0.
+        """
+        probabilities = [self._replica.probabilities[hypothesis] for hypothesis in tracked]
+        others = sum(probabilities) - max(probabilities, default=0.0)
+        if others <= allowed or not self._robot_poses.keys() >= set(tracked):
+            return 0.0
+        maps, areas = self._replica.maps, self._replica.robot_areas
+        localized = [LocalizedHypothesis(maps[h], areas[h], self._robot_poses[h], {areas[h]}) for h in tracked]
+        return elsewhere_probability(localized, probabilities)
 
     def handle(self, message: Message) -> list[Message]:
         """Learn from ``Keyframe`` and ``ClosureDecision``; answer ``AreaEvents`` with ``Hypotheses``."""
@@ -229,9 +249,9 @@ class Tsbi:
         if len(parents) == 1:
             return parents
         poses = [self._estimates[parent.hypothesis].pose.mean for parent in parents]
-        points = self._branching.search.surface_points(keyframe.scan)
+        points, kidnapped = self._branching.search.surface_points(keyframe.scan), self._kidnapped_since
         parents = [
-            self._branching.reweight_by_known_ground(parent, pose, points, keyframe.sequence)
+            self._branching.reweight_by_known_ground(parent, pose, points, keyframe.sequence, kidnapped)
             for parent, pose in zip(parents, poses, strict=True)
         ]
         localized = [
@@ -246,7 +266,8 @@ class Tsbi:
         probability = self._replica.probabilities[hypothesis]
         state = self._state.hypothesis_states[hypothesis]
         # A kidnapping is tested by the walls that beams pass as well.
-        log_evidence = state.surroundings.log_likelihood if self._is_kidnapped else estimate.log_evidence
+        is_kidnapped = self._kidnapped_since is not None
+        log_evidence = state.surroundings.log_likelihood if is_kidnapped else estimate.log_evidence
         return Parent(
             hypothesis,
             self._replica.robot_areas[hypothesis],
@@ -258,10 +279,13 @@ class Tsbi:
         )
 
     @property
-    def _is_kidnapped(self) -> bool:
-        """Whether the robot is kidnapped under one of the hypotheses."""
+    def _kidnapped_since(self) -> int | None:
+        """The first keyframe after a kidnapping of the robot under one of the hypotheses; None without one."""
         localizations = (state.localization for state in self._state.hypothesis_states.values())
-        return any(isinstance(lost, Lost) and lost.tracked_pose is not None for lost in localizations)
+        return min(
+            (lost.since for lost in localizations if isinstance(lost, Lost) and lost.tracked_pose is not None),
+            default=None,
+        )
 
     def _branch(self, parent: Parent, event: AreaEvent | None, keyframe: Keyframe) -> Branches:
         """The children of one hypothesis, each with its weight."""
@@ -357,6 +381,7 @@ class Tsbi:
         self, children: Sequence[Child], survivors: Sequence[Child], probabilities: Float64
     ) -> list[Hypothesis]:
         """The surviving hypotheses; an only child keeps the id of its parent, others get new ones."""
+        self._robot_poses = {}
         siblings = Counter(child.parent for child in children)
         hypotheses = [
             self._hypothesis(child, siblings[child.parent] > 1, float(probability))
@@ -373,7 +398,9 @@ class Tsbi:
         if branched:
             hypothesis = self._state.next_hypothesis
             self._state = replace(self._state, next_hypothesis=hypothesis + 1)
-        localization = child.state.localization
+        localization, pose = child.state.localization, self._estimates[child.parent].pose.mean
+        frame = child.frame_change
+        self._robot_poses[hypothesis] = pose if frame is None else se2.compose(frame.mean, pose)
         newest = -1 if self._keyframe is None else self._keyframe.sequence
         return Hypothesis(
             hypothesis,

@@ -1,4 +1,4 @@
-"""Equivalent hypotheses are distinguished from others."""
+"""Equivalent hypotheses are distinguished from others, and those under which the robot is elsewhere."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,11 @@ import pytest
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.topological_inference.hypothesis_tree import LocalizedHypothesis, merge_equivalent
+from hmt_slam_ros.topological_inference.hypothesis_agreement import (
+    LocalizedHypothesis,
+    elsewhere_probability,
+    merge_equivalent,
+)
 
 SHARP, VAGUE = np.diag([0.05, 0.05, 0.01]) ** 2, np.diag([2.0, 2.0, 0.2]) ** 2
 STEP = np.array([10.0, 0.0, 0.0])
@@ -113,3 +117,39 @@ def test_the_heaviest_represents_all_equivalent_ones():
     found = merge_equivalent(hypotheses, weights)
     assert list(found) == [2, 1]
     np.testing.assert_allclose(np.exp(list(found.values())), [0.7, 0.3])
+
+
+def in_new_ground(covariance):
+    """From area 3 the robot came into a new area, 3 m beside area 0."""
+    hybrid_map = chain()
+    hybrid_map.set_keyframe(9, 9, np.zeros(3))
+    hybrid_map.set_arc(3, 9, PoseGaussian(np.array([-30.0, 3.0, 0.0]), covariance), closure=False)
+    return LocalizedHypothesis(hybrid_map, 9, POSE, {9})
+
+
+@pytest.mark.parametrize(
+    ("offset", "elsewhere"),
+    [([0.9, 0.0, 0.0], False), ([1.2, 0.0, 0.0], True), ([0.0, 0.0, 0.25], False), ([0.0, 0.0, 3.0], True)],
+)
+def test_a_robot_is_elsewhere_where_its_pose_differs_by_more_than_is_uncertain(offset, elsewhere):
+    one, other = (LocalizedHypothesis(chain(), 1, pose, {1}) for pose in (POSE, se2.compose(POSE, np.array(offset))))
+    assert one.is_elsewhere(other) == other.is_elsewhere(one) == elsewhere
+
+
+@pytest.mark.parametrize(("covariance", "elsewhere"), [(SHARP, True), (VAGUE, False)])
+def test_a_robot_behind_a_wide_arc_may_be_where_a_closure_has_it(covariance, elsewhere):
+    closed, new = enter_known_area(0, POSE), in_new_ground(covariance)
+    assert closed.is_elsewhere(new) == elsewhere
+
+
+def test_without_an_area_relative_to_which_both_are_certain_nothing_is_elsewhere():
+    apart = HybridMap()
+    apart.set_keyframe(8, 8, np.zeros(3))
+    assert not enter_known_area(0, POSE).is_elsewhere(LocalizedHypothesis(apart, 8, POSE, {8}))
+
+
+def test_elsewhere_is_what_the_most_probable_hypothesis_denies():
+    hypotheses = [LocalizedHypothesis(chain(), 1, se2.compose(POSE, [x, 0.0, 0.0]), {1}) for x in (9.0, 0.0, 0.3)]
+    assert elsewhere_probability(hypotheses, [0.2, 0.5, 0.3]) == pytest.approx(0.2)
+    assert elsewhere_probability(hypotheses, [0.6, 0.3, 0.1]) == pytest.approx(0.4)
+    assert elsewhere_probability(hypotheses[:1], [0.6]) == 0.0

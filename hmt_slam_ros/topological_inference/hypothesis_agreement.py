@@ -1,0 +1,158 @@
+"""Where the robot is under each hypothesis: which hypotheses state the same, and which state another place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
+from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, AreaPair, HybridMap
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
+
+_SAME_DISTANCE = 0.5
+"""Largest distance between equivalent poses, m; fine alignment closes it.
+
+From docs/decisions/0015-merging-equivalent-hypotheses.md.
+"""
+
+_SAME_ANGLE = math.radians(5.0)
+"""Largest difference of their headings, rad (docs/decisions/0015-merging-equivalent-hypotheses.md)."""
+
+_ALIGNMENT_COVARIANCE = np.diag([0.5 * _SAME_DISTANCE, 0.5 * _SAME_DISTANCE, 0.5 * _SAME_ANGLE]) ** 2
+"""How far fine alignment may move an arc, m and rad, squared."""
+
+_MAX_VARIANCE = 1.0
+"""Largest variance of a position on which a hypothesis is certain, m^2."""
+
+_EQUIVALENCE_GATE = chi_square_gate(0.95)
+"""Largest squared Mahalanobis distance of equivalent arcs."""
+
+_ANOTHER_DISTANCE, _ANOTHER_ANGLE = 1.0, math.radians(15.0)
+"""Distance, m, or angle, rad, from which poses are in two places, if no uncertainty explains it."""
+
+_UNCERTAINTY_GATE = chi_square_gate(0.999)
+"""Squared Mahalanobis distance of two poses up to which the arcs' uncertainty explains that they differ."""
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizedHypothesis:
+    """The map of a hypothesis, and the robot's pose in it, to be compared with another hypothesis.
+
+    Over known ground, hypotheses differ in the area by which they enter it, or in the mode of one match. They state the
+    same topology if their maps would agree after fine alignment.
+
+    :ivar area: the robot's area.
+    :ivar pose: ``area_T_base``, shape (3,).
+    :ivar nearby_areas: the areas that the robot is in or beside.
+    """
+
+    hybrid_map: HybridMap
+    area: int
+    pose: Float64
+    nearby_areas: Collection[int]
+
+    @cached_property
+    def _certain_beliefs(self) -> Mapping[int, PoseGaussian]:
+        """{area: belief over ``area_T_base``} of the areas relative to which the robot's pose is certain."""
+        beliefs = shortest_path_beliefs(self.hybrid_map, self.area, cost_limit=_MAX_VARIANCE)
+        pose = PoseGaussian.from_pose(self.pose)
+        return {area: belief.inverse().compose(pose) for area, belief in beliefs.items()}
+
+    @cached_property
+    def closures(self) -> Mapping[AreaPair, ArcValue]:
+        """The arcs that closed loops and are not definite."""
+        return self.hybrid_map.pending_closures
+
+    @cached_property
+    def removed_arcs(self) -> frozenset[AreaPair]:
+        """The definite arcs that the hypothesis lacks."""
+        return frozenset(pair for pair, arc in self.hybrid_map.changed_arcs.items() if arc is None)
+
+    def is_equivalent(self, other: LocalizedHypothesis) -> bool:
+        """Whether both have the same robot pose in all common areas around it, and close the same loops.
+
+        A closure is a statement of its own, even where the arcs alone imply it.
+        """
+        if bool(self.closures) != bool(other.closures) or self.removed_arcs != other.removed_arcs:
+            return False
+        nearby = {*self.nearby_areas, *other.nearby_areas}
+        common = {area for area in nearby if self._has_areas(area) and other._has_areas(area)}
+        return (
+            bool(common)
+            and all(self._agrees_on_pose(other, area) for area in common)
+            and all(other._implies_closure(pair, arc) for pair, arc in self.closures.items())
+            and all(self._implies_closure(pair, arc) for pair, arc in other.closures.items())
+        )
+
+    def is_elsewhere(self, other: LocalizedHypothesis) -> bool:
+        """Whether the robot is in another place under another hypothesis, and no uncertainty of the arcs explains that.
+
+        It is where its poses differ in one of the areas relative to which both are certain.
+        """
+        one, two = self._certain_beliefs, other._certain_beliefs
+        return any(_are_apart(belief, two[area]) for area, belief in one.items() if area in two)
+
+    def _has_areas(self, *areas: int) -> bool:
+        return all(map(self.hybrid_map.has_area, areas))
+
+    def _implies_closure(self, pair: AreaPair, arc: ArcValue) -> bool:
+        """Whether this hypothesis has two areas as an arc of another one has them, by its own closure or for certain.
+
+        It need not have areas that only the other has.
+        """
+        if not self._has_areas(*pair):
+            return True
+        own = self.closures.get(pair)
+        belief = self._certain_belief(pair, arc) if own is None else own.pose
+        # Fine alignment may move the arc.
+        return (
+            belief is not None
+            and arc.pose.mahalanobis2(PoseGaussian(belief.mean, _ALIGNMENT_COVARIANCE)) <= _EQUIVALENCE_GATE
+        )
+
+    def _certain_belief(self, pair: AreaPair, arc: ArcValue) -> PoseGaussian | None:
+        """The belief over the second of two areas in the first, if it is not much less certain than an arc."""
+        limit = max(_MAX_VARIANCE, 4.0 * float(np.trace(arc.pose.covariance[:2, :2])))
+        return shortest_path_beliefs(self.hybrid_map, pair[0], limit, targets=pair[1:]).get(pair[1])
+
+    def _agrees_on_pose(self, other: LocalizedHypothesis, area: int) -> bool:
+        one, two = self._certain_beliefs.get(area), other._certain_beliefs.get(area)
+        if one is None or two is None:
+            return False
+        difference = se2.between(one.mean, two.mean)
+        is_near = math.hypot(difference[0], difference[1]) <= _SAME_DISTANCE
+        return is_near and abs(float(difference[2])) <= _SAME_ANGLE
+
+
+def merge_equivalent(hypotheses: Sequence[LocalizedHypothesis], log_weights: Sequence[float]) -> dict[int, float]:
+    """{number of a hypothesis: log of the weight of all equivalent ones}, the heaviest of each first."""
+    merged: dict[int, float] = {}
+    for number in sorted(range(len(hypotheses)), key=lambda n: (-log_weights[n], n)):
+        same = next((kept for kept in merged if hypotheses[kept].is_equivalent(hypotheses[number])), number)
+        merged[same] = float(np.logaddexp(merged.get(same, -math.inf), log_weights[number]))
+    return merged
+
+
+def _are_apart(one: PoseGaussian, two: PoseGaussian) -> bool:
+    """Whether poses in one area are in two places, and not only uncertain."""
+    x, y, angle = difference = se2.log(se2.between(one.mean, two.mean))
+    if math.hypot(x, y) <= _ANOTHER_DISTANCE and abs(float(angle)) <= _ANOTHER_ANGLE:
+        return False
+    covariance = one.covariance + two.covariance + _ALIGNMENT_COVARIANCE
+    return float(difference @ np.linalg.solve(covariance, difference)) > _UNCERTAINTY_GATE
+
+
+def elsewhere_probability(hypotheses: Sequence[LocalizedHypothesis], probabilities: Sequence[float]) -> float:
+    """The probability that the robot is in another place than under the most probable hypothesis."""
+    if len(hypotheses) < 2:
+        return 0.0
+    best = hypotheses[int(np.argmax(probabilities))]
+    return sum(
+        p for one, p in zip(hypotheses, probabilities, strict=True) if one is not best and best.is_elsewhere(one)
+    )
