@@ -58,11 +58,14 @@ class LocalizedHypothesis:
     nearby_areas: Collection[int]
 
     @cached_property
-    def _certain_beliefs(self) -> Mapping[int, PoseGaussian]:
-        """{area: belief over ``area_T_base``} of the areas relative to which the robot's pose is certain."""
-        beliefs = shortest_path_beliefs(self.hybrid_map, self.area, cost_limit=_MAX_VARIANCE)
-        pose = PoseGaussian.from_pose(self.pose)
-        return {area: belief.inverse().compose(pose) for area, belief in beliefs.items()}
+    def _certain_areas(self) -> Mapping[int, PoseGaussian]:
+        """{area: belief over its pose in the robot's} of the areas relative to which the robot's pose is certain."""
+        return shortest_path_beliefs(self.hybrid_map, self.area, cost_limit=_MAX_VARIANCE)
+
+    @cached_property
+    def _poses_in_areas(self) -> Mapping[int, Float64]:
+        """{area: ``area_T_base``} of the same areas."""
+        return {area: se2.between(belief.mean, self.pose) for area, belief in self._certain_areas.items()}
 
     @cached_property
     def closures(self) -> Mapping[AreaPair, ArcValue]:
@@ -95,8 +98,20 @@ class LocalizedHypothesis:
 
         It is where its poses differ in one of the areas relative to which both are certain.
         """
-        one, two = self._certain_beliefs, other._certain_beliefs
-        return any(_are_apart(belief, two[area]) for area, belief in one.items() if area in two)
+        common = self._certain_areas.keys() & other._certain_areas.keys()
+        return any(self._is_apart(other, area) for area in sorted(common))
+
+    def _is_apart(self, other: LocalizedHypothesis, area: int) -> bool:
+        """Whether the poses in an area are in two places, and not only uncertain."""
+        one, two = self._poses_in_areas[area], other._poses_in_areas[area]
+        x, y, angle = difference = se2.log(se2.between(one, two))
+        if math.hypot(x, y) <= _ANOTHER_DISTANCE and abs(float(angle)) <= _ANOTHER_ANGLE:
+            return False
+        spread = sum(
+            hypothesis._certain_areas[area].inverse().compose(PoseGaussian.from_pose(hypothesis.pose)).covariance
+            for hypothesis in (self, other)
+        )
+        return float(difference @ np.linalg.solve(spread + _ALIGNMENT_COVARIANCE, difference)) > _UNCERTAINTY_GATE
 
     def _has_areas(self, *areas: int) -> bool:
         return all(map(self.hybrid_map.has_area, areas))
@@ -122,10 +137,10 @@ class LocalizedHypothesis:
         return shortest_path_beliefs(self.hybrid_map, pair[0], limit, targets=pair[1:]).get(pair[1])
 
     def _agrees_on_pose(self, other: LocalizedHypothesis, area: int) -> bool:
-        one, two = self._certain_beliefs.get(area), other._certain_beliefs.get(area)
+        one, two = self._poses_in_areas.get(area), other._poses_in_areas.get(area)
         if one is None or two is None:
             return False
-        difference = se2.between(one.mean, two.mean)
+        difference = se2.between(one, two)
         is_near = math.hypot(difference[0], difference[1]) <= _SAME_DISTANCE
         return is_near and abs(float(difference[2])) <= _SAME_ANGLE
 
@@ -137,15 +152,6 @@ def merge_equivalent(hypotheses: Sequence[LocalizedHypothesis], log_weights: Seq
         same = next((kept for kept in merged if hypotheses[kept].is_equivalent(hypotheses[number])), number)
         merged[same] = float(np.logaddexp(merged.get(same, -math.inf), log_weights[number]))
     return merged
-
-
-def _are_apart(one: PoseGaussian, two: PoseGaussian) -> bool:
-    """Whether poses in one area are in two places, and not only uncertain."""
-    x, y, angle = difference = se2.log(se2.between(one.mean, two.mean))
-    if math.hypot(x, y) <= _ANOTHER_DISTANCE and abs(float(angle)) <= _ANOTHER_ANGLE:
-        return False
-    covariance = one.covariance + two.covariance + _ALIGNMENT_COVARIANCE
-    return float(difference @ np.linalg.solve(covariance, difference)) > _UNCERTAINTY_GATE
 
 
 def elsewhere_probability(hypotheses: Sequence[LocalizedHypothesis], probabilities: Sequence[float]) -> float:
