@@ -157,12 +157,14 @@ class Tsbi:
     def _elsewhere_probability(self, tracked: Sequence[int], allowed: float) -> float:
         """The probability that the robot is elsewhere than the most probable of some hypotheses has it.
 
-        :param allowed: where those that are less probable have no more together, they are not compared: 0.
+        After a restart all others count until the next keyframe event: where they have the robot is not known.
+
+        :param allowed: where those that are less probable have no more together, they are not compared.
         """
         probabilities = [self._replica.probabilities[hypothesis] for hypothesis in tracked]
         others = sum(probabilities) - max(probabilities, default=0.0)
         if others <= allowed or not self._robot_poses.keys() >= set(tracked):
-            return 0.0
+            return others
         maps, areas = self._replica.maps, self._replica.robot_areas
         localized = [LocalizedHypothesis(maps[h], areas[h], self._robot_poses[h], {areas[h]}) for h in tracked]
         return elsewhere_probability(localized, probabilities)
