@@ -151,7 +151,7 @@ class Tsbi:
         )
         distribution = None if is_reset else self._pose_distribution
         allowed = self._options.lost_probability
-        elsewhere = 0.0 if lost > allowed else self._elsewhere_probability(tracked, allowed)
+        elsewhere = 0.0 if lost > allowed else self._elsewhere_probability(tracked, allowed - lost)
         return summarize_localization(areas, lost, self._state.unexamined, known, distribution, allowed, elsewhere)
 
     def _elsewhere_probability(self, tracked: Sequence[int], allowed: float) -> float:
@@ -159,7 +159,7 @@ class Tsbi:
 
         After a restart all others count until the next keyframe event: where they have the robot is not known.
 
-        :param allowed: where those that are less probable have no more together, they are not compared.
+        :param allowed: where the others have no more together, this is all they have: they are not compared.
         """
         probabilities = [self._replica.probabilities[hypothesis] for hypothesis in tracked]
         others = sum(probabilities) - max(probabilities, default=0.0)
