@@ -5,6 +5,7 @@ from play_for_tlca import SPREAD, Play, belief, new_area, poses_of
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import fuse
+from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative, uninformative_belief
 from hmt_slam_ros.messages.map_changes import Arc, AreaMerge, MovedKeyframe
 from hmt_slam_ros.messages.messages import Hypothesis
 
@@ -54,6 +55,17 @@ def test_an_arc_seen_twice_before_acceptance_counts_both_times():
     product = fuse([belief(first), belief(second)])
     np.testing.assert_allclose(play.arc(0, 1, 1).mean, product.mean, atol=1e-9)
     np.testing.assert_allclose(play.arc(0, 1, 1).covariance, product.covariance, atol=1e-9)
+
+
+def test_an_uninformative_arc_replaces_what_was_observed():
+    play = Play()
+    play.start()
+    play.step(new_area(0, 0, 1.0, 1, [4.0, 0.0, 0.5]))
+    unknown = uninformative_belief(np.array([9.0, 2.0, 1.0]))
+    verdict = play.step(Hypothesis(0, 0, 1.0, 1, None, (), (Arc(0, 1, unknown),)))
+    (arc,) = verdict.arcs
+    np.testing.assert_allclose(arc.pose.mean, unknown.mean)
+    assert is_uninformative(play.arc(0, 1))
 
 
 def test_an_arc_is_fused_only_on_acceptance():

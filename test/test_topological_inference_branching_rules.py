@@ -301,6 +301,16 @@ def test_where_arcs_are_wide_keyframes_begin_an_area_at_once_and_are_compared_th
     np.testing.assert_allclose(arc.pose.mean, se2.inverse(fit(6, 0.0).mode.measured.mean))
 
 
+def test_behind_a_wide_heading_keyframes_are_not_compared_with_areas_where_the_robot_is_searched():
+    given = GivenComparison(AreaComparison(Transition({6: 0.6}, 0.4), (fit(6, -2.0),), (6,), (), 0.0), 1)
+    branching, parent = given.branching(), make_parent()
+    wide = {**parent.state.covariances, 14: np.diag([0.1, 0.1, 0.8]) ** 2}
+    (child,) = branching.cut(replace(parent, state=replace(parent.state, covariances=wide)), [14]).children
+    assert (child.area, child.log_weight, child.state.is_lost) == (7, -0.7, True)
+    assert child.state.comparison is None
+    assert given.requested == []
+
+
 @pytest.mark.parametrize(("kind", "compared", "goes_on"), [("cut", [12, 13], True), ("recheck", [10, 11], False)])
 def test_halfway_to_the_end_of_the_local_map_keyframes_begin_an_area_before_they_are_compared(kind, compared, goes_on):
     given = GivenComparison(AreaComparison(Transition({6: 0.1}, 1.0), (), (6,), (), 0.0), 3)

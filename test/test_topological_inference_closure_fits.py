@@ -16,7 +16,7 @@ from hmt_slam_ros.topological_inference.area_comparison import ExaminedArea
 from hmt_slam_ros.topological_inference.branches import Parent
 from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.candidate_gating import EntryPrior
-from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, first_new_keyframe
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, first_new_keyframe, known_ground_log_ratio
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
 from hmt_slam_ros.topological_inference.place_recognition import (
     PerceptualAliasing,
@@ -78,16 +78,20 @@ def test_known_ground_is_that_of_keyframes_older_than_thirty_events_in_steps_of_
         assert first_new_keyframe(keyframe) == before
 
 
-def test_what_contradicts_known_ground_counts_less_among_clutter():
+def test_known_ground_is_what_keyframes_before_one_saw():
     search, requested = ClosureSearch(Configuration(), {}), []
-    points, pose = np.zeros((3, 2)), np.array([1.0, 2.0, 0.3])
-    grid = SimpleNamespace(compare=lambda *given: requested.append(given) or Agreement(100, 80, 20))
+    points, pose, agreement = np.zeros((3, 2)), np.array([1.0, 2.0, 0.3]), Agreement(100, 80, 20)
+    grid = SimpleNamespace(compare=lambda *given: requested.append(given) or agreement)
     search._grid_cache = SimpleNamespace(grid_before=lambda _map, _poses, before: requested.append(before) or grid)
-    found = [search.known_ground_log_ratio(HybridMap(), {}, points, pose, 20, clutter) for clutter in (0.0, 0.002, 0.1)]
-    assert requested[:2] == [20, (points, pose)]
+    assert search.known_ground_agreement(HybridMap(), {}, points, pose, 20) is agreement
+    assert requested == [20, (points, pose)]
+
+
+def test_what_contradicts_known_ground_counts_less_among_clutter():
+    agreement = Agreement(100, 80, 20)
+    found = [known_ground_log_ratio(agreement, clutter) for clutter in (0.0, 0.002, 0.1)]
     expected = [
-        SCAN_IN_STORED_MAP.log_likelihood_ratio(Agreement(100, 80, 20), rate)
-        for rate in (MAPS_OUTLIER_RATE, MAPS_OUTLIER_RATE, 0.1)
+        SCAN_IN_STORED_MAP.log_likelihood_ratio(agreement, rate) for rate in (MAPS_OUTLIER_RATE, MAPS_OUTLIER_RATE, 0.1)
     ]
     assert found == pytest.approx(expected)
     assert found[2] > found[0] + 1.0

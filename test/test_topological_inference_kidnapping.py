@@ -393,7 +393,7 @@ def test_without_mapping_a_probable_kidnapping_that_no_match_refutes_loses_the_r
     monkeypatch, log_odds, confirmed, lost
 ):
     pose = PoseInArea(5, 30, np.array([1.0, 1.0, 0.3]))
-    priors = KidnappingPriors(OPTIONS.kidnapping_prior, 0.01)
+    priors = KidnappingPriors(OPTIONS.kidnapping_prior, 0.01, 0.25)
     evidence = {29: 1.0, 30: log_odds - priors.log_odds("ordinary", {}) - 1.0}
     parent = make_parent(Tracking())
     state = replace(parent.state, kidnapping_evidence=evidence, unstored_poses={30: pose})

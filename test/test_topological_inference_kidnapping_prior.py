@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,13 @@ from ring_for_tsbi import RING, Run, ring_drive
 from test_topological_inference_branching import OTHER, PATH, ROOM, rooms_apart
 
 from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.messages.messages import HypothesisEstimate
+from hmt_slam_ros.registration.consistency import Agreement, Clutter
+from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, known_ground_log_ratio
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState, PoseInArea
 from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
+from hmt_slam_ros.topological_inference.kidnapping_evidence import CUSUM_DRIFT, log_displacement_ratio
 from hmt_slam_ros.topological_inference.kidnapping_prior import EventCounts, KidnappingPriors, add_counts
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
@@ -27,7 +33,7 @@ def after_events(scans, conditions=None, state=None, first=5):
     """The state after events: the sum of what ends and walls contradict, nats, and {index: condition}."""
     state = state or HypothesisState()
     for n, nats in enumerate(scans):
-        state = state.after_motion(first + n, (conditions or {}).get(n, "ordinary"))
+        state = state.after_motion(first + n, (conditions or {}).get(n, "ordinary"), PRIORS)
         state = state.after_scan(first + n, -0.5 * nats, -0.5 * nats, PRIORS)
     return state
 
@@ -73,7 +79,9 @@ def test_after_a_fault_the_same_scans_make_a_kidnapping_more_probable(condition)
     ordinary, event = after_events(scans).kidnapping_test(PRIORS)
     faulty, onset = after_events(scans, {1: condition}).kidnapping_test(PRIORS)
     assert (event, onset) == (6, 6)
-    assert 3.5 < faulty - ordinary < math.log(1.0 / PRIORS.fault)
+    # Evidence of ordinary motions has a drift of 1 nat at each event.
+    assert 3.5 + 2.0 * CUSUM_DRIFT + math.log(1.0 - PRIORS.aliasing) < faulty - ordinary
+    assert faulty - ordinary < math.log(1.0 / PRIORS.fault) + 2.0 * CUSUM_DRIFT
 
 
 def test_the_fault_is_the_onset_where_the_first_scan_after_it_shows_little():
@@ -90,14 +98,27 @@ def test_a_fault_alone_is_no_evidence():
     assert state.kidnapping_test(PRIORS) == (-math.inf, 0)
 
 
-def test_a_fault_before_scans_that_fit_is_forgotten():
-    state = after_events((0.5, -4.0, -4.0), {0: "after_gap"})
-    assert not state.kidnapping_evidence
-    assert not state.onset_conditions
+def test_a_fault_before_scans_that_fit_is_remembered_since_another_place_may_be_similar():
+    state = after_events((0.5, *(-4.0,) * 5), {0: "after_gap"})
+    assert state.onset_conditions == {5: "after_gap"}
+    assert state.kidnapping_test(PRIORS) == (-math.inf, 0)
+    odds, onset = after_events((6.0, 6.0), state=state, first=11).kidnapping_test(PRIORS)
     alone = HypothesisState(surroundings=state.surroundings, kidnapping_counts=state.kidnapping_counts)
-    tests = [after_events((6.0, 4.0), state=before, first=8).kidnapping_test(PRIORS) for before in (state, alone)]
-    assert tests[0] == tests[1]
-    assert tests[0][1] == 8
+    others, _ = after_events((6.0, 6.0), state=alone, first=11).kidnapping_test(PRIORS)
+    assert onset == 5
+    assert odds > others + 1.0
+
+
+def test_the_longer_scans_fit_the_less_a_fault_counts():
+    states = [after_events((*(-4.0,) * n, 6.0, 6.0), {0: "after_gap"}) for n in (2, 6, 10)]
+    odds = [state.kidnapping_test(PRIORS)[0] for state in states]
+    assert odds[0] > odds[1] > odds[2]
+    assert not after_events((-4.0,) * 28, {0: "after_gap"}).onset_conditions
+
+
+def test_a_usual_fault_is_not_remembered():
+    usual = HypothesisState(kidnapping_counts={"ordinary": EventCounts(1000, 0), "after_gap": EventCounts(300, 0)})
+    assert not after_events((0.5,), {0: "after_gap"}, state=usual).onset_conditions
 
 
 def test_a_fault_is_remembered_as_long_as_evidence():
@@ -109,6 +130,17 @@ def test_a_fault_is_remembered_as_long_as_evidence():
 def test_a_fault_while_evidence_adds_up_does_not_replace_a_better_onset():
     _, onset = after_events((12.0, 1.1, 1.1), {2: "after_gap"}).kidnapping_test(PRIORS)
     assert onset == 5
+
+
+def test_the_evidence_since_a_fault_is_that_of_all_places_where_the_robot_may_be():
+    """By an enumeration of the events at which a similar place ends."""
+    evidence, similar, end = {3: 99.0, 5: -0.4, 6: 1.2, 7: -2.0, 8: 3.0}, 0.25, 0.1
+    ratios = [math.exp(nats + CUSUM_DRIFT) for event, nats in evidence.items() if event >= 5]
+    expected = (1.0 - similar) * math.prod(ratios)
+    for n in range(1, len(ratios)):
+        expected += similar * (1.0 - end) ** (n - 1) * end * math.prod(ratios[n:])
+    expected += similar * (1.0 - end) ** (len(ratios) - 1)
+    assert log_displacement_ratio(evidence, 5, similar) == pytest.approx(math.log(expected), rel=1e-12)
 
 
 def spawn(condition, counts=None, nats=0.5):
@@ -132,7 +164,7 @@ def test_a_fault_spawns_a_kidnapped_hypothesis_on_less_evidence(condition):
     assert kidnapped.state.kidnapping_counts == {condition: (0, 1)}
     for child in (stays, kidnapped):
         assert not child.state.onset_conditions
-    assert spawn(condition, nats=-0.5) is None
+    assert spawn(condition, nats=-5.0 * CUSUM_DRIFT) is None
 
 
 def test_repeated_kidnappings_raise_the_prior():
@@ -173,7 +205,30 @@ def test_the_counts_are_part_of_the_state_and_a_resumed_inference_decides_alike(
     run.keyframe(poses[12], motion_condition="after_gap")
     resumed = Tsbi(Configuration(), state=run.tsbi.state)
     (before,), (after,) = (own.state.hypothesis_states.values() for own in (run.tsbi, resumed))
-    assert before.onset_conditions == after.onset_conditions == {12: "after_gap"}
+    assert before.onset_conditions == after.onset_conditions == {3: "after_gap", 12: "after_gap"}
     assert before.kidnapping_test(PRIORS) == after.kidnapping_test(PRIORS)
     assert after.kidnapping_counts["after_gap"] == (2, 0)
-    np.testing.assert_equal(list(before.kidnapping_evidence), [12])
+    assert list(before.kidnapping_evidence) == list(range(3, 13))
+
+
+def test_after_a_fault_scans_count_by_the_ground_from_before_it(monkeypatch):
+    """Ends as that ground has them, and walls that agree by its share of the scan; contradictions count in full."""
+    run, before = Run(RING), []
+    for n, pose in enumerate(ring_drive(14)[:13]):
+        run.keyframe(pose, motion_condition="after_gap" if n == 12 else "ordinary")
+    agreement = Agreement(100, 40, 9)
+    monkeypatch.setattr(ClosureSearch, "known_ground_agreement", lambda *given: before.append(given[-1]) or agreement)
+    (state,), keyframe = (
+        run.tsbi.state.hypothesis_states.values(),
+        SimpleNamespace(sequence=13, scan=run.replica.scans[12]),
+    )
+    estimate = HypothesisEstimate(0, 0, PoseGaussian.from_pose(np.zeros(3)), True, 0.7, -1.9, Clutter(0.1, 0.0), 12.0)
+    ends, walls = run.tsbi._log_ratios(estimate, state, keyframe)
+    assert before == [10]
+    assert ends == known_ground_log_ratio(agreement, 0.1)
+    assert walls == pytest.approx(0.4 * 1.2)
+    _, contradicting = run.tsbi._log_ratios(replace(estimate, log_kidnapping_ratio=1.1), state, keyframe)
+    assert contradicting == pytest.approx(-1.8)
+    ordinary = replace(state, onset_conditions={})
+    assert run.tsbi._log_ratios(estimate, ordinary, keyframe) == pytest.approx((0.7, 1.2))
+    assert before == [10, 10]

@@ -165,6 +165,15 @@ def test_one_that_is_kidnapped_while_it_maps_notices_and_is_recognized():
     assert max(found.errors) < 0.1
 
 
+@pytest.mark.parametrize("seed", [1, 3])
+def test_one_that_is_kidnapped_in_a_gap_of_scans_notices_and_is_recognized(seed):
+    found = drive_kidnapped(f"sim:office,seed={seed},size=0.7,laps=2,carried=0.6,to=0.75,turned=120", gap=4.0)
+    assert found.noticed <= SOON
+    assert found.again <= FAR
+    assert not found.confident
+    assert max(found.errors) < 0.1
+
+
 def test_one_that_is_kidnapped_while_it_stores_nothing_notices_and_is_recognized(office):
     run = LockStepRun(Configuration(mode="localization"), state=office.state)
     run.lock_step.feed(PoseReset())

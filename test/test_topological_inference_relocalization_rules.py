@@ -11,12 +11,13 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
+from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative, uninformative_belief
 from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.topological_inference import event_work, relocalization
 from hmt_slam_ros.topological_inference.branches import Branches, Parent
+from hmt_slam_ros.topological_inference.candidate_gating import CandidateGating
 from hmt_slam_ros.topological_inference.event_work import EventWork
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseHint
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
@@ -149,6 +150,7 @@ class GivenSearch(SimpleNamespace):
         super().__init__(first_areas=[], remaining=events, unexamined={}, **given)
         self.search = SimpleNamespace(
             work=EventWork(),
+            gating=CandidateGating(OPTIONS),
             check_candidates=lambda _map, search, _clutter, _hint=None: (search, True),
             begin_global_search=self.begin,
             continue_global_search=self.go_on,
@@ -384,6 +386,26 @@ def test_a_relocalized_child_has_the_probability_of_its_candidate_and_an_arc_to_
     assert relocalization.accept_relocalization(found).children == [relocalized]
     only_lost = Branches([lost])
     assert relocalization.accept_relocalization(only_lost).children == [lost]
+
+
+@pytest.mark.parametrize(("off", "is_refuted"), [(0.0, False), (1.5, False), (2.5, True)])
+def test_a_wide_arc_that_does_not_admit_the_pose_found_says_nothing_any_more(off, is_refuted):
+    """Behind it the robot was lost, and found where its drive cannot have led: it was moved."""
+    hybrid_map, found_at = make_map(), np.array([2.0, 1.0, 0.4])
+    reference = hybrid_map.keyframes(5)[20]
+    implied = se2.compose(se2.compose(ARC, found_at), se2.inverse(reference))
+    measured = se2.compose(implied, [off, 0.0, 0.0])
+    hybrid_map.set_arc(0, 5, PoseGaussian(measured, np.diag([0.5, 0.5, 0.7]) ** 2), closure=False)
+    hint = PoseHint(20, 1, PoseGaussian(found_at, SHARP))
+    _, _, found = search(Lost(20, pose_hint=hint), (candidate(1, found_at), 0.95), hybrid_map=hybrid_map)
+    lost, relocalized = found.children
+    closure, *refuted = relocalized.arcs
+    assert (closure.source, closure.target, closure.closure) == (5, 1, True)
+    assert [(arc.source, arc.target) for arc in refuted] == [(0, 5)] * is_refuted
+    for arc in refuted:
+        assert is_uninformative(arc.pose)
+        np.testing.assert_allclose(arc.pose.mean, implied)
+    assert lost.arcs == ()
 
 
 def test_a_kidnapped_hypothesis_counts_its_evidence_once():

@@ -273,10 +273,12 @@ class Acceptance:
     def _fuse_arc(self, pending: PendingArc, old: Arc | None, observers: frozenset[int]) -> Arc:
         """The definite arc from a new observation and the old arc, which decides whether it closed a loop.
 
+        An uninformative one replaces the old arc.
+
         :param observers: the keyframes by which the old arc was observed.
         """
         belief, closure = pending.pose, pending.closure
-        if old is not None and not is_uninformative(old.pose):
+        if old is not None and not is_uninformative(old.pose) and not is_uninformative(belief):
             shared = len(pending.observing_keyframes & observers) / len(pending.observing_keyframes)
             known = old.pose if old.source == pending.source else old.pose.inverse()
             belief, closure = fuse_traversals(known, belief, shared), old.closure

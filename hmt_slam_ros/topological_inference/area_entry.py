@@ -75,9 +75,14 @@ class AreaEntry:
         """New ground: the reference keyframe becomes the frame of a new area."""
         origin = PoseGaussian.from_pose(np.zeros(3))
         child = self.enter_area(parent, query, self.new_area(parent, query), origin, query.belief, log_factor)
-        # With any heading, gates admit all places, and a search of the whole map costs less than comparisons.
-        is_lost = not child.state.is_lost and has_wide_heading(query.belief.covariance, self._filter)
-        return lose(child, parent, query) if is_lost else child
+        return lose(child, parent, query) if self.is_lost_beyond(parent, query) else child
+
+    def is_lost_beyond(self, parent: Parent, query: Query) -> bool:
+        """Whether the robot is lost on new ground behind an arc of unknown heading.
+
+        With any heading, gates admit all places, and a search of the whole map costs less than comparisons.
+        """
+        return not parent.state.is_lost and has_wide_heading(query.belief.covariance, self._filter)
 
     def enter_meanwhile(self, parent: Parent, query: Query, comparison: OngoingComparison) -> Child:
         """The only child, in a new area of the keyframes ``query``, while the comparison of some of them goes on."""

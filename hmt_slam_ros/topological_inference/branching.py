@@ -35,7 +35,12 @@ from hmt_slam_ros.topological_inference.area_comparison import (
 from hmt_slam_ros.topological_inference.area_entry import AreaEntry, lose
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.candidate_gating import Query
-from hmt_slam_ros.topological_inference.closure_search import ClosureSearch, SearchState, first_new_keyframe
+from hmt_slam_ros.topological_inference.closure_search import (
+    ClosureSearch,
+    SearchState,
+    first_new_keyframe,
+    known_ground_log_ratio,
+)
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, LandmarkEvidence, PoseHint
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     Lost,
@@ -189,9 +194,8 @@ class Branching:
         """
         poses = {parent.area: np.zeros(3), **parent.local_area_poses()}
         before = first_new_keyframe(keyframe) if kidnapped is None else kidnapped
-        log_ratio = self.search.known_ground_log_ratio(
-            parent.hybrid_map, poses, points, pose, before, parent.clutter.beam_outlier_rate
-        )
+        agreement = self.search.known_ground_agreement(parent.hybrid_map, poses, points, pose, before)
+        log_ratio = known_ground_log_ratio(agreement, parent.clutter.beam_outlier_rate)
         if kidnapped is not None:
             log_ratio = max(0.0, log_ratio)
         return replace(parent, log_weight=parent.log_weight + log_ratio)
@@ -206,10 +210,7 @@ class Branching:
         """
         query, ongoing = self.entry.query(parent, keyframes), parent.state.comparison
         if is_wide(query.belief.covariance, self._filter):
-            found = self._compare_cut(parent, query, {parent.area})
-            if isinstance(found, OngoingComparison):
-                return Branches([self.entry.enter_meanwhile(parent, query, found)])
-            return self._branch_at_cut(parent, query, found)
+            return self._cut_behind_wide_arc(parent, query)
         is_far = self._is_far_from_origin(parent, keyframes)
         if ongoing is not None and is_far and not _belongs_to_cut(ongoing, keyframes):
             ongoing = None  # of keyframes that stay behind
@@ -226,6 +227,15 @@ class Branching:
             return self.continue_comparison(parent, ongoing)
         if isinstance(found, OngoingComparison):
             return Branches([self.entry.enter_meanwhile(parent, query, found) if is_far else self._wait(parent, found)])
+        return self._branch_at_cut(parent, query, found)
+
+    def _cut_behind_wide_arc(self, parent: Parent, query: Query) -> Branches:
+        """The children of a cut to which a wide motion led; a robot that is lost there is searched, not compared."""
+        if self.entry.is_lost_beyond(parent, query):
+            return Branches([self.entry.enter_new(parent, query, 0.0)])
+        found = self._compare_cut(parent, query, {parent.area})
+        if isinstance(found, OngoingComparison):
+            return Branches([self.entry.enter_meanwhile(parent, query, found)])
         return self._branch_at_cut(parent, query, found)
 
     def _is_far_from_origin(self, parent: Parent, keyframes: Sequence[int]) -> bool:

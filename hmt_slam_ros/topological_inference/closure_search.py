@@ -26,7 +26,13 @@ from hmt_slam_ros.hybrid_map.surroundings import (
     stack_poses,
 )
 from hmt_slam_ros.registration.area_to_area import MatchMode, MatchSettings, match_areas
-from hmt_slam_ros.registration.consistency import MAP_IN_MAP, MAPS_OUTLIER_RATE, SCAN_IN_STORED_MAP, Clutter
+from hmt_slam_ros.registration.consistency import (
+    MAP_IN_MAP,
+    MAPS_OUTLIER_RATE,
+    SCAN_IN_STORED_MAP,
+    Agreement,
+    Clutter,
+)
 from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid, surface_points
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.relative_motion import is_wide
@@ -210,26 +216,17 @@ class ClosureSearch:
         """Surface points of a scan, shape (n, 2), m, base frame."""
         return surface_points(scan, self._model)
 
-    def known_ground_log_ratio(
-        self,
-        hybrid_map: HybridMap,
-        poses: Mapping[int, Pose],
-        points: Float64,
-        pose: Pose,
-        before: int,
-        clutter: float = 0.0,
-    ) -> float:
-        """log p(scan | the robot is there) / p(scan | it is in a similar place), by the keyframes before one, nats.
+    def known_ground_agreement(
+        self, hybrid_map: HybridMap, poses: Mapping[int, Pose], points: Float64, pose: Pose, before: int
+    ) -> Agreement:
+        """The agreement of a scan with what the keyframes before one saw.
 
         :param poses: {area: ``area_T_other``} of the areas that the robot is in or beside.
         :param points: of :meth:`surface_points`.
         :param pose: ``area_T_base`` of the scan.
         :param before: of :func:`first_new_keyframe`, or the first one after a kidnapping.
-        :param clutter: usual rate of beams that contradict the robot's map, where that is above the rate of maps.
         """
-        grid = self._grid_cache.grid_before(hybrid_map, poses, before)
-        rate = max(MAPS_OUTLIER_RATE, clutter)
-        return SCAN_IN_STORED_MAP.log_likelihood_ratio(grid.compare(points, pose), rate)
+        return self._grid_cache.grid_before(hybrid_map, poses, before).compare(points, pose)
 
     def begin_comparison(
         self,
@@ -493,6 +490,15 @@ class ClosureSearch:
             log_offset = -0.5 * max(0.0, distance - entry.median_mahalanobis2)
             log_weight = math.log(pi) + mode.log_mass - log_total_mass + log_evidence + log_offset
             yield Fit(area, mode, log_weight)
+
+
+def known_ground_log_ratio(agreement: Agreement, clutter: float) -> float:
+    """log p(scan | the robot is there) / p(scan | it is in a similar place), nats.
+
+    :param agreement: of the scan with known ground.
+    :param clutter: usual rate of beams that contradict the robot's map, where that is above the rate of maps.
+    """
+    return SCAN_IN_STORED_MAP.log_likelihood_ratio(agreement, max(MAPS_OUTLIER_RATE, clutter))
 
 
 def first_new_keyframe(keyframe: int) -> int:

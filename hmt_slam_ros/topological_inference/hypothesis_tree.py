@@ -14,19 +14,16 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.messages import MotionCondition
 from hmt_slam_ros.topological_inference.area_comparison import OngoingComparison
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseHint
+from hmt_slam_ros.topological_inference.kidnapping_evidence import (
+    CUSUM_DRIFT,
+    EVIDENCE_WINDOW,
+    cusum_since,
+    log_displacement_ratio,
+)
 from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingCounts, KidnappingPriors, add_counts
 from hmt_slam_ros.topological_inference.surroundings_change import Surroundings
 
 Covariance = Float64
-
-_CUSUM_DRIFT = 1.0
-"""Drift of the CUSUM statistic per keyframe, nats: people contradict the map in several keyframes.
-
-From docs/decisions/0026-kidnapping-detection.md.
-"""
-
-_CUSUM_WINDOW = 30
-"""Keyframe events for which evidence of a kidnapping is kept."""
 
 _ONSET_SHARE = 0.2
 """Smallest share of the largest evidence with which the kidnapping can begin."""
@@ -198,10 +195,15 @@ class HypothesisState:
         """Whether the hypothesis is lost."""
         return isinstance(self.localization, Lost)
 
-    def after_motion(self, event: int, condition: MotionCondition) -> HypothesisState:
-        """The state after the motion to a keyframe event, before its scan."""
+    def after_motion(self, event: int, condition: MotionCondition, priors: KidnappingPriors) -> HypothesisState:
+        """The state after the motion to a keyframe event, before its scan.
+
+        Faults that are usual in this map are not remembered: an onset that scans show later loses little against them.
+        """
         counts = add_counts(self.kidnapping_counts, condition, events=1)
-        conditions = self.onset_conditions if condition == "ordinary" else {**self.onset_conditions, event: condition}
+        more = priors.log_odds(condition, counts) - priors.log_odds("ordinary", counts)
+        is_telling = more > CUSUM_DRIFT - math.log(priors.aliasing)
+        conditions = {**self.onset_conditions, event: condition} if is_telling else self.onset_conditions
         return replace(self, kidnapping_counts=counts, onset_conditions=conditions)
 
     def after_scan(
@@ -220,8 +222,8 @@ class HypothesisState:
         :param unstored_pose: the robot's pose, if the map does not hold the scan.
         """
         surroundings = self.surroundings.update(log_ends, log_walls)
-        increment = -surroundings.log_likelihood - _CUSUM_DRIFT
-        evidence = {k: nats for k, nats in self.kidnapping_evidence.items() if k > event - _CUSUM_WINDOW}
+        increment = -surroundings.log_likelihood - CUSUM_DRIFT
+        evidence = {k: nats for k, nats in self.kidnapping_evidence.items() if k > event - EVIDENCE_WINDOW}
         if evidence or increment > 0.0 or event in self.onset_conditions:
             evidence[event] = increment
         evidence = self._relevant_evidence(evidence, priors)
@@ -243,10 +245,15 @@ class HypothesisState:
         """
         ordinary = priors.log_odds("ordinary", self.kidnapping_counts)
         for first in sorted({*list(evidence)[:1], *self.onset_conditions.keys() & evidence.keys()}):
-            since = {event: nats for event, nats in evidence.items() if event >= first}
-            if self._prior_log_odds(first, priors) - ordinary + sum(since.values()) > 0.0:
-                return since
+            if self._prior_log_odds(first, priors) - ordinary + self._statistic(evidence, first, priors) > 0.0:
+                return {event: nats for event, nats in evidence.items() if event >= first}
         return {}
+
+    def _statistic(self, evidence: Mapping[int, float], first: int, priors: KidnappingPriors) -> float:
+        """The evidence of scans for a kidnapping before an event, nats."""
+        if first in self.onset_conditions:
+            return log_displacement_ratio(evidence, first, priors.aliasing)
+        return cusum_since(evidence, first)
 
     def _prior_log_odds(self, event: int, priors: KidnappingPriors) -> float:
         return priors.log_odds(self.onset_condition(event), self.kidnapping_counts)
@@ -263,9 +270,10 @@ class HypothesisState:
         candidates |= {min(event for event, nats in evidence.items() if nats >= onset)} if onset > 0.0 else set()
         best = -math.inf, 0
         for first in sorted(candidates):
-            statistic = sum(nats for event, nats in evidence.items() if event >= first)
+            statistic = self._statistic(evidence, first, priors)
             log_odds = self._prior_log_odds(first, priors) + statistic
-            if statistic > 0.0 and log_odds > best[0]:
+            least = CUSUM_DRIFT if first in self.onset_conditions else 0.0
+            if statistic > least and log_odds > best[0]:
                 best = log_odds, first
         return best
 

@@ -45,15 +45,18 @@ class KidnappingPriors(NamedTuple):
 
     :ivar kidnapping: of kidnappings.
     :ivar fault: of motions of each condition that is not ordinary, without a kidnapping.
+    :ivar aliasing: probability that a robot is put where the map looks as at its tracked pose.
     """
 
     kidnapping: float
     fault: float
+    aliasing: float
 
     @classmethod
     def from_configuration(cls, configuration: Configuration) -> KidnappingPriors:
         """The priors of a configuration."""
-        return cls(configuration.tsbi.kidnapping_prior, configuration.motion.fault_probability)
+        tsbi = configuration.tsbi
+        return cls(tsbi.kidnapping_prior, configuration.motion.fault_probability, tsbi.aliasing_prior)
 
     def log_odds(self, condition: MotionCondition, counts: KidnappingCounts) -> float:
         """Log-odds of a kidnapping before an event, by the posterior mean.

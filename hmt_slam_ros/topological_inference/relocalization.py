@@ -9,7 +9,7 @@ decides on it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -137,12 +137,24 @@ def _hinted_arcs(parent: Parent, since: int, pose_hint: PoseHint, pose: Pose) ->
 
     :param pose: ``area_T_base`` of the hint's keyframe, in the robot's area.
     """
-    for known, new, arc in parent.hybrid_map.all_arcs():
-        if is_uninformative(arc.pose) and min(parent.hybrid_map.keyframes(new), default=-1) >= since:
-            area_T_new = shortest_path_beliefs(parent.hybrid_map, parent.area, targets=(new,))[new].mean
-            mean = se2.compose(_hinted_pose(parent, known, pose_hint), se2.between(pose, area_T_new))
+    for known, new, arc in _arcs_from_before(parent, since):
+        if is_uninformative(arc):
+            mean = se2.compose(_hinted_pose(parent, known, pose_hint), se2.between(pose, _area_frame(parent, new)))
             return (Arc(known, new, uninformative_belief(mean)),)
     return ()
+
+
+def _arcs_from_before(parent: Parent, since: int) -> Iterator[tuple[int, int, PoseGaussian]]:
+    """The arcs by which the areas of before and those since a keyframe are joined: (known, new, ``known_T_new``)."""
+    for known, new, arc in parent.hybrid_map.all_arcs():
+        first, second = (min(parent.hybrid_map.keyframes(area), default=-1) for area in (known, new))
+        if first < since <= second:
+            yield known, new, arc.pose
+
+
+def _area_frame(parent: Parent, area: int) -> Pose:
+    """``robot_area_T_area`` of an area that arcs join to the robot's, shape (3,)."""
+    return shortest_path_beliefs(parent.hybrid_map, parent.area, targets=(area,))[area].mean
 
 
 def is_search_due(parent: Parent, options: InferenceParameters) -> bool:
@@ -247,7 +259,9 @@ def _conclude_search(
         parent.hybrid_map, lost, candidate, poses
     ):
         reference = se2.compose(keyframes[newest], se2.inverse(poses[newest]))
-        still_lost, relocalized = _split_at_candidate(parent, with_candidate, reference, candidate, probability)
+        still_lost, relocalized = _split_at_candidate(
+            parent, with_candidate, reference, candidate, probability, branching.search.gating.gate
+        )
         children = [still_lost, _count_kidnapping(parent.hybrid_map, relocalized, lost, candidate, poses)]
     else:
         children = [_child_with_localization(parent, with_candidate)]
@@ -283,13 +297,14 @@ def _count_kidnapping(
 
 
 def _split_at_candidate(
-    parent: Parent, lost: Lost, reference: Pose, candidate: PoseCandidate, probability: float
+    parent: Parent, lost: Lost, reference: Pose, candidate: PoseCandidate, probability: float, gate: float
 ) -> list[Child]:
     """The two children where a pose is accepted: still lost, and relocalized there.
 
     :param lost: the state of the lost one.
     :param reference: ``area_T_reference`` of the keyframes that were searched, shape (3,).
     :param probability: of the candidate.
+    :param gate: squared Mahalanobis distance up to which arcs admit a pose.
     """
     # From here on, evidence for the candidate counts for the relocalized child.
     still_lost = _child_with_localization(parent, replace(lost, counted_evidence=None))
@@ -297,11 +312,33 @@ def _split_at_candidate(
     relocalized = replace(
         _child_with_localization(parent, Tracking(candidate.area)),
         log_weight=parent.log_weight + math.log(probability),
-        arcs=(Arc(parent.area, candidate.area, belief, True),),
+        arcs=(
+            Arc(parent.area, candidate.area, belief, True),
+            *_refuted_arcs(parent, lost, candidate.area, belief, gate),
+        ),
         reload_local_map=True,
     )
     log_weight = parent.log_weight + math.log(max(1.0 - probability, 1e-300))
     return [replace(still_lost, log_weight=log_weight), relocalized]
+
+
+def _refuted_arcs(parent: Parent, lost: Lost, known: int, belief: PoseGaussian, gate: float) -> tuple[Arc, ...]:
+    """The arcs into the areas since the robot was lost that do not admit the pose found, as uninformative ones.
+
+    It was moved before the first keyframe of these areas then, and the arc says nothing.
+
+    :param known: the area in which the robot was found.
+    :param belief: over ``robot_area_T_known``.
+    """
+    refuted = []
+    for before, new, arc in _arcs_from_before(parent, lost.since):
+        to_known = shortest_path_beliefs(parent.hybrid_map, before, targets=(known,)).get(known)
+        if to_known is None or is_uninformative(arc):
+            continue
+        found = to_known.compose(belief.inverse()).compose(PoseGaussian.from_pose(_area_frame(parent, new)))
+        if arc.mahalanobis2(found) > gate:
+            refuted.append(Arc(before, new, uninformative_belief(found.mean)))
+    return tuple(refuted)
 
 
 def _child_with_localization(parent: Parent, localization: Tracking | Lost) -> Child:

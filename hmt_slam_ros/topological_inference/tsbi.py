@@ -30,6 +30,7 @@ from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, GlobalPoses, Replica
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.branching import Branching, BranchingState
+from hmt_slam_ros.topological_inference.closure_search import known_ground_log_ratio
 from hmt_slam_ros.topological_inference.hypothesis_agreement import (
     LocalizedHypothesis,
     elsewhere_probability,
@@ -57,6 +58,10 @@ from hmt_slam_ros.topological_inference.relocalization import (
     is_searching,
     update_relocalization,
 )
+
+_ONSET_STEP = 10
+"""Keyframe events between two changes of the ground that counts as seen before a fault, so that its grid stays cached.
+"""
 
 _OVERLAP_PERSISTENCE = 3
 """Keyframe events in a row that the robot has to be in an area of the submap before an arc joins it."""
@@ -195,15 +200,37 @@ class Tsbi:
             if not keyframe.mapping and not estimate.stored:
                 unstored_pose = PoseInArea(estimate.area, keyframe.sequence, estimate.pose.mean)
             state = states[estimate.hypothesis]
-            log_walls = -estimate.log_kidnapping_ratio - estimate.log_evidence
-            state = state.after_motion(keyframe.sequence, keyframe.motion_condition)
-            state = state.after_scan(keyframe.sequence, estimate.log_evidence, log_walls, priors, unstored_pose)
+            state = state.after_motion(keyframe.sequence, keyframe.motion_condition, priors)
+            log_ends, log_walls = self._log_ratios(estimate, state, keyframe)
+            state = state.after_scan(keyframe.sequence, log_ends, log_walls, priors, unstored_pose)
             if estimate.stored:
                 state = state.after_keyframe(keyframe.sequence, estimate.pose.covariance)
             states[estimate.hypothesis] = state
         self._state = replace(self._state, hypothesis_states=states)
         wanted = {event for state in states.values() for event in state.unstored_poses}
         self._branching.keep_scans(keyframe.sequence, keyframe.scan, wanted)
+
+    def _log_ratios(
+        self, estimate: HypothesisEstimate, state: HypothesisState, keyframe: Keyframe
+    ) -> tuple[float, float]:
+        """log p(scan | not kidnapped) / p(scan | kidnapped) of the ends of its beams, and of walls they hit or pass.
+
+        After a motion that was not ordinary, agreement with what the robot saw since tells nothing.
+
+        :param state: after the motion to the keyframe.
+        """
+        log_ends, log_walls = estimate.log_evidence, -estimate.log_kidnapping_ratio - estimate.log_evidence
+        onset = min(state.onset_conditions, default=keyframe.sequence)
+        if onset == keyframe.sequence:
+            return log_ends, log_walls
+        hybrid_map, search = self._replica.maps[estimate.hypothesis], self._branching.search
+        local_areas = {area: pose for area, pose in state.local_area_poses.items() if hybrid_map.has_area(area)}
+        poses, points = {estimate.area: np.zeros(3), **local_areas}, search.surface_points(keyframe.scan)
+        agreement = search.known_ground_agreement(
+            hybrid_map, poses, points, estimate.pose.mean, onset // _ONSET_STEP * _ONSET_STEP
+        )
+        log_ends = known_ground_log_ratio(agreement, estimate.clutter.beam_outlier_rate)
+        return log_ends, min(0.0, log_walls) + agreement.matched_share * max(0.0, log_walls)
 
     def _infer(self, events: AreaEvents) -> Hypotheses:
         """Weigh, branch, normalize, reduce."""
