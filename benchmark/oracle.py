@@ -33,6 +33,7 @@ from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.candidate_gating import AreaCandidate, Query
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
+from hmt_slam_ros.topological_inference.map_search import MapSearch
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 WORLDS = {
@@ -277,6 +278,7 @@ class _UnboundedBranching(Branching):
     def __init__(self, configuration: Configuration, replica: Replica) -> None:
         super().__init__(configuration, replica)
         self.search = _UnboundedSearch(configuration, replica.scans)
+        self.map_search = MapSearch(configuration, replica.scans, self.search.work)
 
 
 class _EverywhereSearch(_UnboundedSearch):

@@ -27,11 +27,11 @@ from hmt_slam_ros.messages.messages import AreaEvents, Keyframe, PrunedKeyframe
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.topological_inference import kidnapping, relocalization
-from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
 from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, HypothesisState, Lost, PoseInArea, Tracking
 from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
 from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingPriors
+from hmt_slam_ros.topological_inference.map_search import MapSearch
 from hmt_slam_ros.topological_inference.pose_distribution import UNMAPPED_PRIOR, PoseDistribution
 from hmt_slam_ros.topological_inference.relocalization import KIDNAPPED_UNMAPPED_PRIOR
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
@@ -130,13 +130,13 @@ def test_without_mapping_it_moves_to_the_area_of_its_relocalization(mapping, are
 
 
 def test_it_is_searched_in_the_map_from_before_the_kidnapping(monkeypatch):
-    searches, begin = [], ClosureSearch.begin_global_search
+    searches, begin = [], MapSearch.begin
 
-    def record_search(closure_search, hybrid_map, poses, before, *others):
+    def record_search(map_search, hybrid_map, poses, before, *others):
         searches.append((before, sorted(poses)))
-        return begin(closure_search, hybrid_map, poses, before, *others)
+        return begin(map_search, hybrid_map, poses, before, *others)
 
-    monkeypatch.setattr(ClosureSearch, "begin_global_search", record_search)
+    monkeypatch.setattr(MapSearch, "begin", record_search)
     spawn((ROOM, OTHER, ROOM), {2: 8.0})
     assert searches == [(14, [14, 15, 16, 17])]
 
@@ -148,7 +148,7 @@ def test_unmapped_ground_is_as_probable_as_the_map_for_a_kidnapped_robot_alone(i
     vague = PoseGaussian(np.zeros(3), np.eye(3))
     candidate = PoseCandidate(0, MatchMode(vague, vague, 0.0), Agreement(0, 0, 0))
     found = PoseDistribution((candidate,), np.array([1.0 - UNMAPPED_PRIOR]))
-    monkeypatch.setattr(ClosureSearch, "localize_globally", lambda *_: found)
+    monkeypatch.setattr(MapSearch, "localize", lambda *_: found)
     tracked_pose = PoseInArea(1, newest[0], np.zeros(3)) if is_kidnapped else None
     state = replace(parent.state, localization=Lost(newest[0], tracked_pose=tracked_pose, counted_evidence=None))
     branches = relocalization.update_relocalization(branching, replace(parent, state=state))

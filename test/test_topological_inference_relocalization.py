@@ -21,7 +21,7 @@ from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter
 from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.simulation.scenario import START
 from hmt_slam_ros.topological_inference import event_work
-from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
+from hmt_slam_ros.topological_inference.map_search import MapSearch
 from hmt_slam_ros.topological_inference.tsbi import TsbiState
 
 WORLD = "sim:office,seed=3,size=0.7"
@@ -103,7 +103,7 @@ def test_in_the_map_of_the_first_half_it_starts_in_the_second_near_keyframes_of_
 
 def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, monkeypatch):
     """Every other look finds it 5 m off."""
-    looks, found = [], ClosureSearch.localize_globally
+    looks, found = [], MapSearch.localize
 
     def off_at_times(search, *requested):
         looks.append(found(search, *requested))
@@ -115,7 +115,7 @@ def test_it_is_not_believed_to_be_where_one_look_alone_finds_it(office, begin, m
         ]
         return looks[-1]._replace(candidates=tuple(moved))
 
-    monkeypatch.setattr(ClosureSearch, "localize_globally", off_at_times)
+    monkeypatch.setattr(MapSearch, "localize", off_at_times)
     run = start_in_map(office, office.records[begin:], 150)
     (hypothesis,) = run.recorder.hypotheses[max(run.recorder.hypotheses)].hypotheses
     assert sum(look.best is not None and look.best[1] > 0.9 for look in looks) >= 3

@@ -148,12 +148,12 @@ class GivenSearch(SimpleNamespace):
 
     def __init__(self, events=1, **given):
         super().__init__(first_areas=[], remaining=events, unexamined={}, **given)
-        self.search = SimpleNamespace(
+        self.search = SimpleNamespace(gating=CandidateGating(OPTIONS))
+        self.map_search = SimpleNamespace(
             work=EventWork(),
-            gating=CandidateGating(OPTIONS),
             check_candidates=lambda _map, search, _clutter, _hint=None: (search, True),
-            begin_global_search=self.begin,
-            continue_global_search=self.go_on,
+            begin=self.begin,
+            continue_search=self.go_on,
             search_now=lambda hybrid_map, search, area, _clutter: self.go_on(hybrid_map, search, area),
             plausible_areas=lambda _map, _found: frozenset({1, 2}),
             is_conclusive=lambda _map, _search, _clutter, _hint=None: self.remaining == 0,
@@ -205,7 +205,7 @@ def test_a_search_that_may_confirm_a_candidate_goes_through_all_areas_that_are_l
     lost = Lost(21, candidate=PoseInArea(1, 22, np.zeros(3)), plausible_areas=frozenset({1, 2}))
     for before, events in ((lost, 2), (Lost(21), 1)):
         branching, parent = GivenSearch(2, options=OPTIONS, found=distribution()), make_parent(before)
-        branching.search.is_conclusive = lambda *_: True
+        branching.map_search.is_conclusive = lambda *_: True
         branching.unexamined = {2: 0.5}
         for _ in range(events):
             assert parent.state.localization.searched < 0
@@ -251,15 +251,15 @@ class ExhaustingSearch(GivenSearch):
 
     def __init__(self, **given):
         super().__init__(**given)
-        self.search.check_candidates = self.check
+        self.map_search.check_candidates = self.check
 
     def go_on(self, hybrid_map, search, first=None):
         search = super().go_on(hybrid_map, search, first)
-        self.search.work.add(event_work._MAX_WORK)
+        self.map_search.work.add(event_work._MAX_WORK)
         return replace(search, unexamined={3: 0.1} if search.candidates else {})
 
     def check(self, _hybrid_map, search, _clutter, _hint=None):
-        return search, not (search.candidates and self.search.work.is_exhausted)
+        return search, not (search.candidates and self.map_search.work.is_exhausted)
 
 
 @pytest.mark.parametrize(("probability", "refuted"), [(0.9, 0), (0.5, 1)])
@@ -270,7 +270,7 @@ def test_candidates_are_tested_at_the_event_after_a_search_that_took_the_work(pr
     (child,) = (found := relocalization.update_relocalization(branching, parent)).children
     assert not found.closures_searched
     assert child.state.localization.search.candidates
-    branching.search.work.begin_event()
+    branching.map_search.work.begin_event()
     (child,) = relocalization.update_relocalization(branching, replace(parent, state=child.state)).children
     lost = child.state.localization
     assert len(branching.first_areas) == 1
@@ -292,7 +292,7 @@ def test_a_search_without_candidates_ends_at_once():
 
 def test_a_search_waits_at_an_event_whose_work_is_done():
     branching, parent = GivenSearch(options=OPTIONS, found=distribution()), make_parent(Lost(21))
-    branching.search.work.add(event_work._MAX_WORK)
+    branching.map_search.work.add(event_work._MAX_WORK)
     (child,) = relocalization.update_relocalization(branching, parent).children
     assert child.state is parent.state
     assert branching.first_areas == []

@@ -47,6 +47,7 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import (
     Tracking,
 )
 from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingPriors
+from hmt_slam_ros.topological_inference.map_search import MapSearch
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
 MIN_PROPOSAL_PROBABILITY = 0.5
@@ -93,6 +94,7 @@ class Branching:
 
     :ivar entry: makes those that enter an area.
     :ivar search: finds and compares known areas.
+    :ivar map_search: searches the whole map for a lost robot.
     :ivar landmarks: their evidence on places and loops, where the configuration asks for it.
     :ivar unstored_scans: {keyframe event: scan} of scans that no map holds and that may still be matched.
     :ivar options: parameters of the inference.
@@ -114,6 +116,7 @@ class Branching:
         self.unstored_scans: dict[int, Scan] = {}
         scans = ChainMap(self.unstored_scans, replica.scans)
         self.search = ClosureSearch(configuration, scans)
+        self.map_search = MapSearch(configuration, scans, self.search.work)
         self.landmarks = None if landmarks is None else landmarks(configuration, scans)
         self.options = configuration.tsbi
         self.kidnapping_priors = KidnappingPriors.from_configuration(configuration)
@@ -124,12 +127,14 @@ class Branching:
     @property
     def state(self) -> BranchingState:
         """What is remembered between two events."""
-        return BranchingState(self.entry.largest_area, self.search.state, dict(self.unstored_scans))
+        search = replace(self.search.state, region_maps=self.map_search.state)
+        return BranchingState(self.entry.largest_area, search, dict(self.unstored_scans))
 
     def restore(self, state: BranchingState) -> None:
         """Start from a saved state."""
         self.entry.largest_area = state.largest_area
         self.search.restore(state.search)
+        self.map_search.restore(state.search.region_maps)
         self.unstored_scans.update(state.unstored_scans)
 
     def localize_globally(
@@ -141,7 +146,7 @@ class Branching:
 
         :param pose_hint: of the reference.
         """
-        distribution = self.search.localize_globally(parent.hybrid_map, search, parent.clutter, pose_hint)
+        distribution = self.map_search.localize(parent.hybrid_map, search, parent.clutter, pose_hint)
         lost = parent.state.localization
         if self.landmarks is None or not isinstance(lost, Lost) or lost.candidate is None:
             return distribution
@@ -157,13 +162,14 @@ class Branching:
 
     def end_global_localization(self) -> None:
         """Free what served global localization."""
-        self.search.end_global_localization()
+        self.map_search.end()
         if self.landmarks is not None:
             self.landmarks.on_localized()
 
     def forget_scans(self) -> None:
         """Drop what was computed from scans, of which some have changed."""
         self.search.forget_scans()
+        self.map_search.forget_scans()
         if self.landmarks is not None:
             self.landmarks.forget_scans()
 

@@ -31,7 +31,6 @@ from hmt_slam_ros.registration.consistency import (
     MAPS_OUTLIER_RATE,
     SCAN_IN_STORED_MAP,
     Agreement,
-    Clutter,
 )
 from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid, surface_points
 from hmt_slam_ros.sensors import Scan
@@ -53,30 +52,15 @@ from hmt_slam_ros.topological_inference.candidate_gating import (
     transition_model,
 )
 from hmt_slam_ros.topological_inference.event_work import CELL_WORK, EventWork
-from hmt_slam_ros.topological_inference.global_localization import (
-    GlobalSearch,
-    PoseHint,
-    begin_search,
-    check_candidates,
-    continue_search,
-    is_conclusive,
-    localize_globally,
-    plausible_areas,
-    search_region,
-)
 from hmt_slam_ros.topological_inference.global_scan_matching import (
-    FreeSpaceCheck,
-    GlobalScanMatcher,
     query_bounds,
 )
 from hmt_slam_ros.topological_inference.place_recognition import (
     MIN_LOG_RATIO,
     NegativeSample,
     PerceptualAliasing,
-    ScanDescriptors,
     best_share,
 )
-from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
 Pose = Float64
 
@@ -105,7 +89,7 @@ class SearchState:
     :ivar negative_shares: matched shares of keyframes in places where they do not lie, the latest.
     :ivar newest_sampled: the newest keyframe of the last sample, -1 before the first.
     :ivar place_maps: the maps that comparisons hold: their work does not count again.
-    :ivar region_maps: the maps that global localization holds.
+    :ivar region_maps: the maps that the search of the whole map holds.
     :ivar places_ahead: places whose maps are made at events without other work, the last one first.
     """
 
@@ -135,15 +119,6 @@ class ClosureSearch:
         self.work = EventWork()
         self._grid_cache = GridCache(scans, self._model, self.submap_radius, count_cells=self._count_cells)
         self._aliasing = PerceptualAliasing(options.aliasing_prior)
-        self._descriptors = ScanDescriptors(scans)
-        self._whole_map_cache = GridCache(scans, self._model, self.submap_radius, count_cells=self._count_cells)
-        self._global_matcher = GlobalScanMatcher(
-            self._whole_map_cache,
-            FreeSpaceCheck(scans, configuration),
-            self._settings,
-            options.place_radius,
-            options.local_reach,
-        )
         self._newest_sampled = -1
         self._places_ahead: list[PlaceAhead] = []
 
@@ -154,8 +129,7 @@ class ClosureSearch:
             tuple(self._aliasing.negative_shares),
             self._newest_sampled,
             self._grid_cache.state,
-            self._whole_map_cache.state,
-            tuple(self._places_ahead),
+            places_ahead=tuple(self._places_ahead),
         )
 
     def restore(self, state: SearchState) -> None:
@@ -163,7 +137,6 @@ class ClosureSearch:
         self._aliasing.add_negatives(state.negative_shares)
         self._newest_sampled = state.newest_sampled
         self._grid_cache.restore(state.place_maps)
-        self._whole_map_cache.restore(state.region_maps)
         self._places_ahead = list(state.places_ahead)
 
     def _count_cells(self, cells: int) -> None:
@@ -172,8 +145,6 @@ class ClosureSearch:
     def forget_scans(self) -> None:
         """Drop what was computed from scans, of which some have changed."""
         self._grid_cache.clear()
-        self._whole_map_cache.clear()
-        self._descriptors.clear()
 
     def tracked_area(self, hybrid_map: HybridMap, area: int, around: Mapping[int, Pose], poses: Float64) -> int | None:
         """The area in whose place most of the poses lie, among areas of certain position; None for no area.
@@ -349,92 +320,6 @@ class ClosureSearch:
             if hybrid_map.has_area(area):
                 self._negative_sample(hybrid_map, area, excluded)
                 return
-
-    def begin_global_search(
-        self,
-        hybrid_map: HybridMap,
-        poses: Mapping[int, Pose],
-        before: int,
-        pose_hint: PoseHint | None = None,
-        only: Collection[int] = (),
-    ) -> GlobalSearch:
-        """A search of the whole map, before its first region.
-
-        :param poses: {keyframe: ``reference_T_base``}.
-        :param before: the map is that of the keyframes before this one.
-        :param pose_hint: of the reference.
-        :param only: the only areas to search, since fewer keyframes fitted nowhere else; all if empty.
-        """
-        known = {area: [k for k in hybrid_map.keyframes(area) if k < before] for area in hybrid_map.area_ids()}
-        known = {area: keyframes for area, keyframes in known.items() if keyframes}
-        probabilities = self._descriptors.area_probabilities(list(poses), known)
-        return begin_search(hybrid_map, poses, before, probabilities, pose_hint, self._options.place_radius, only)
-
-    def continue_global_search(
-        self, hybrid_map: HybridMap, search: GlobalSearch, first: int | None = None
-    ) -> GlobalSearch:
-        """The search after one event.
-
-        :param first: the area whose region comes first, if it was not searched yet.
-        """
-        return continue_search(search, self._global_matcher, hybrid_map, self.work, first)
-
-    def search_now(self, hybrid_map: HybridMap, search: GlobalSearch, area: int, clutter: Clutter) -> GlobalSearch:
-        """The search after the region of an area and the walls there, whatever work they take, and others meanwhile.
-
-        :param clutter: usual rate of contradictions of the robot's map.
-        """
-        search = search_region(search, self._global_matcher, hybrid_map, self.work, area)
-        search, is_checked = self.continue_global_search(hybrid_map, search), False
-        while not is_checked:
-            own, prior = EventWork(), self._options.aliasing_prior
-            search, is_checked = check_candidates(search, self._global_matcher, own, prior, hybrid_map, clutter)
-            self.work.add(own.done)
-        return search
-
-    def check_candidates(
-        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
-    ) -> tuple[GlobalSearch, bool]:
-        """The search after the walls of its probable candidates were checked, and whether all were at this event.
-
-        :param clutter: usual rate of contradictions of the robot's map.
-        :param pose_hint: of the reference.
-        """
-        prior = self._options.aliasing_prior
-        return check_candidates(search, self._global_matcher, self.work, prior, hybrid_map, clutter, pose_hint)
-
-    def is_conclusive(
-        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
-    ) -> bool:
-        """Whether the search is over.
-
-        :param clutter: usual rate of contradictions of the robot's map.
-        :param pose_hint: of the reference.
-        """
-        probability = self._options.relocalization_probability
-        return is_conclusive(search, self._options.aliasing_prior, hybrid_map, clutter, pose_hint, probability)
-
-    def localize_globally(
-        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
-    ) -> PoseDistribution:
-        """The distribution of the keyframes' pose in the whole map, as far as it was searched.
-
-        :param clutter: usual rate of contradictions of the robot's map.
-        :param pose_hint: of the reference.
-        """
-        prior = self._options.aliasing_prior
-        return localize_globally(search, prior, hybrid_map, clutter, pose_hint)
-
-    def plausible_areas(self, hybrid_map: HybridMap, distribution: PoseDistribution) -> frozenset[int]:
-        """The areas in which the keyframes of a search may be, and those around; none where they may be anywhere.
-
-        More keyframes are searched there alone: they fit nowhere else, as fewer did not.
-        """
-        return plausible_areas(distribution, hybrid_map, self._options.local_reach)
-
-    def end_global_localization(self) -> None:
-        """Free the grids of the whole map, which take as much memory as a large building's submaps."""
-        self._whole_map_cache.clear()
 
     def _entry_probability(self, place: AreaPlace, candidate: AreaCandidate) -> EntryPrior:
         return entry_prior(place, candidate.prior, stack_poses(candidate.unmatched_poses), self._options.place_radius)

@@ -74,8 +74,8 @@ def _confirms_tracked_pose(branching: Branching, parent: Parent, since: int) -> 
         return False
     first = min(tracked)
     poses = {keyframe: se2.between(tracked[first], pose) for keyframe, pose in tracked.items()}
-    search = branching.search.begin_global_search(parent.hybrid_map, poses, first)
-    search = branching.search.search_now(parent.hybrid_map, search, parent.area, parent.clutter)
+    search = branching.map_search.begin(parent.hybrid_map, poses, first)
+    search = branching.map_search.search_now(parent.hybrid_map, search, parent.area, parent.clutter)
     distribution = branching.localize_globally(parent, search)
     tracked_pose = PoseInArea(parent.area, first, tracked[first])
     return prefers_tracked_pose(parent.hybrid_map, distribution, tracked_pose, poses, branching.options)
@@ -91,16 +91,16 @@ def _keyframes_since(parent: Parent, event: int) -> list[int]:
 def _kidnapped_child(branching: Branching, parent: Parent, keyframes: Sequence[int], log_odds: float) -> Child:
     """The child that was kidnapped before the first of some keyframes of its area, which begin a new area."""
     query = branching.entry.query(parent, keyframes)
-    search = branching.search.begin_global_search(parent.hybrid_map, query.poses, keyframes[0])
-    search = branching.search.search_now(parent.hybrid_map, search, parent.area, parent.clutter)
+    search = branching.map_search.begin(parent.hybrid_map, query.poses, keyframes[0])
+    search = branching.map_search.search_now(parent.hybrid_map, search, parent.area, parent.clutter)
     distribution = branching.localize_globally(parent, search).with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
     tracked_pose = PoseInArea(parent.area, keyframes[0], query.belief.mean)
     evidence = log_bayes_factor(parent.hybrid_map, distribution, tracked_pose, query.poses)
     child = branching.entry.enter_unknown(parent, query, log_odds + evidence)
     lost = Lost(keyframes[0], tracked_pose=tracked_pose, counted_evidence=evidence)
-    if branching.search.is_conclusive(parent.hybrid_map, search, parent.clutter):
+    if branching.map_search.is_conclusive(parent.hybrid_map, search, parent.clutter):
         candidate = decisive_candidate(distribution, query.poses, branching.options)
-        plausible = branching.search.plausible_areas(parent.hybrid_map, distribution)
+        plausible = branching.map_search.plausible_areas(parent.hybrid_map, distribution)
         lost = replace(lost, candidate=candidate, plausible_areas=plausible, searched=max(query.poses))
     else:
         lost = replace(lost, search=search)

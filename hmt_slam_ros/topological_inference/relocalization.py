@@ -182,16 +182,16 @@ def update_relocalization(branching: Branching, parent: Parent) -> Branches:
     """
     lost = parent.state.localization
     assert isinstance(lost, Lost)
-    if branching.search.work.is_exhausted:
+    if branching.map_search.work.is_exhausted:
         return Branches([parent.unchanged_child()])
     search = lost.search or _begin_search(branching, parent, lost)
     if lost.search is None or not _is_conclusive(branching, parent, lost, search):
         first = None if lost.candidate is None else lost.candidate.area
-        search = branching.search.continue_global_search(parent.hybrid_map, search, first)
+        search = branching.map_search.continue_search(parent.hybrid_map, search, first)
     is_over = _is_conclusive(branching, parent, lost, search)
     hint = _hint_of_first(lost, search.poses)
     if is_over:
-        search, is_over = branching.search.check_candidates(parent.hybrid_map, search, parent.clutter, hint)
+        search, is_over = branching.map_search.check_candidates(parent.hybrid_map, search, parent.clutter, hint)
     if not is_over:
         return Branches([_child_with_localization(parent, replace(lost, search=search))])
     after = replace(lost, search=None, searched=max(search.poses))
@@ -208,7 +208,7 @@ def _is_conclusive(branching: Branching, parent: Parent, lost: Lost, search: Glo
     if lost.candidate is not None and search.unexamined:
         return False
     hint = _hint_of_first(lost, search.poses)
-    return branching.search.is_conclusive(parent.hybrid_map, search, parent.clutter, hint)
+    return branching.map_search.is_conclusive(parent.hybrid_map, search, parent.clutter, hint)
 
 
 def _is_without_candidate(child: Child) -> bool:
@@ -222,7 +222,7 @@ def _begin_search(branching: Branching, parent: Parent, lost: Lost) -> GlobalSea
     reference = next(iter(keyframes.values()))
     poses = {k: se2.between(reference, pose) for k, pose in keyframes.items()}
     hint = _hint_of_first(lost, poses)
-    return branching.search.begin_global_search(parent.hybrid_map, poses, lost.since, hint, lost.plausible_areas)
+    return branching.map_search.begin(parent.hybrid_map, poses, lost.since, hint, lost.plausible_areas)
 
 
 def _conclude_search(
@@ -246,14 +246,14 @@ def _conclude_search(
     lost = _after_refutation(lost, distribution, poses)
     best = distribution.best
     if best is None or not _is_decisive(*best, branching.options, is_kidnapped=is_kidnapped):
-        plausible = branching.search.plausible_areas(parent.hybrid_map, distribution)
+        plausible = branching.map_search.plausible_areas(parent.hybrid_map, distribution)
         children = [_child_with_localization(parent, replace(lost, candidate=None, plausible_areas=plausible))]
         return Branches(children, True, pose_distribution=distribution)
     candidate, probability = best
     with_candidate = replace(
         lost,
         candidate=_pose_in_area(candidate, poses, max(poses)),
-        plausible_areas=branching.search.plausible_areas(parent.hybrid_map, distribution),
+        plausible_areas=branching.map_search.plausible_areas(parent.hybrid_map, distribution),
     )
     if (hint is not None and probability >= branching.options.hint_probability) or _confirms_candidate(
         parent.hybrid_map, lost, candidate, poses

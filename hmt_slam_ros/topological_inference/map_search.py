@@ -1,0 +1,155 @@
+"""The search of the whole map for a lost robot, with the maps of its regions and the parameters it goes by."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.surroundings import GridCache, GridCacheState, Neighborhood
+from hmt_slam_ros.registration.area_to_area import MatchSettings
+from hmt_slam_ros.registration.consistency import Clutter
+from hmt_slam_ros.registration.likelihood_grid import GridModel
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.topological_inference.event_work import CELL_WORK, EventWork
+from hmt_slam_ros.topological_inference.global_localization import (
+    GlobalSearch,
+    PoseHint,
+    begin_search,
+    check_candidates,
+    continue_search,
+    is_conclusive,
+    localize_globally,
+    plausible_areas,
+    search_region,
+)
+from hmt_slam_ros.topological_inference.global_scan_matching import FreeSpaceCheck, GlobalScanMatcher
+from hmt_slam_ros.topological_inference.place_recognition import ScanDescriptors
+from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
+
+Pose = Float64
+
+
+class MapSearch:
+    """Searches the whole of a hybrid map for keyframes.
+
+    :ivar work: of the event, which it shares with the comparison of areas.
+    """
+
+    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan], work: EventWork) -> None:
+        """:param scans: {keyframe: scan}, which may grow."""
+        self._options = options = configuration.tsbi
+        self.work = work
+        self._descriptors = ScanDescriptors(scans)
+        radius = Neighborhood(options.local_sigma, options.local_reach)
+        model = GridModel.from_configuration(configuration)
+        self._grid_cache = GridCache(scans, model, radius, count_cells=self._count_cells)
+        self._matcher = GlobalScanMatcher(
+            self._grid_cache,
+            FreeSpaceCheck(scans, configuration),
+            MatchSettings.from_options(options),
+            options.place_radius,
+            options.local_reach,
+        )
+
+    @property
+    def state(self) -> GridCacheState:
+        """The maps that it holds."""
+        return self._grid_cache.state
+
+    def restore(self, state: GridCacheState) -> None:
+        """Start from a saved state."""
+        self._grid_cache.restore(state)
+
+    def _count_cells(self, cells: int) -> None:
+        self.work.add(CELL_WORK * cells)
+
+    def forget_scans(self) -> None:
+        """Drop what was computed from scans, of which some have changed."""
+        self._grid_cache.clear()
+        self._descriptors.clear()
+
+    def begin(
+        self,
+        hybrid_map: HybridMap,
+        poses: Mapping[int, Pose],
+        before: int,
+        pose_hint: PoseHint | None = None,
+        only: Collection[int] = (),
+    ) -> GlobalSearch:
+        """A search of the whole map, before its first region.
+
+        :param poses: {keyframe: ``reference_T_base``}.
+        :param before: the map is that of the keyframes before this one.
+        :param pose_hint: of the reference.
+        :param only: the only areas to search, since fewer keyframes fitted nowhere else; all if empty.
+        """
+        known = {area: [k for k in hybrid_map.keyframes(area) if k < before] for area in hybrid_map.area_ids()}
+        known = {area: keyframes for area, keyframes in known.items() if keyframes}
+        probabilities = self._descriptors.area_probabilities(list(poses), known)
+        return begin_search(hybrid_map, poses, before, probabilities, pose_hint, self._options.place_radius, only)
+
+    def continue_search(self, hybrid_map: HybridMap, search: GlobalSearch, first: int | None = None) -> GlobalSearch:
+        """The search after one event.
+
+        :param first: the area whose region comes first, if it was not searched yet.
+        """
+        return continue_search(search, self._matcher, hybrid_map, self.work, first)
+
+    def search_now(self, hybrid_map: HybridMap, search: GlobalSearch, area: int, clutter: Clutter) -> GlobalSearch:
+        """The search after the region of an area and the walls there, whatever work they take, and others meanwhile.
+
+        :param clutter: usual rate of contradictions of the robot's map.
+        """
+        search = search_region(search, self._matcher, hybrid_map, self.work, area)
+        search, is_checked = self.continue_search(hybrid_map, search), False
+        while not is_checked:
+            own, prior = EventWork(), self._options.aliasing_prior
+            search, is_checked = check_candidates(search, self._matcher, own, prior, hybrid_map, clutter)
+            self.work.add(own.done)
+        return search
+
+    def check_candidates(
+        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
+    ) -> tuple[GlobalSearch, bool]:
+        """The search after the walls of its probable candidates were checked, and whether all were at this event.
+
+        :param clutter: usual rate of contradictions of the robot's map.
+        :param pose_hint: of the reference.
+        """
+        prior = self._options.aliasing_prior
+        return check_candidates(search, self._matcher, self.work, prior, hybrid_map, clutter, pose_hint)
+
+    def is_conclusive(
+        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
+    ) -> bool:
+        """Whether the search is over.
+
+        :param clutter: usual rate of contradictions of the robot's map.
+        :param pose_hint: of the reference.
+        """
+        probability = self._options.relocalization_probability
+        return is_conclusive(search, self._options.aliasing_prior, hybrid_map, clutter, pose_hint, probability)
+
+    def localize(
+        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
+    ) -> PoseDistribution:
+        """The distribution of the keyframes' pose in the whole map, as far as it was searched.
+
+        :param clutter: usual rate of contradictions of the robot's map.
+        :param pose_hint: of the reference.
+        """
+        prior = self._options.aliasing_prior
+        return localize_globally(search, prior, hybrid_map, clutter, pose_hint)
+
+    def plausible_areas(self, hybrid_map: HybridMap, distribution: PoseDistribution) -> frozenset[int]:
+        """The areas in which the keyframes of a search may be, and those around; none where they may be anywhere.
+
+        More keyframes are searched there alone: they fit nowhere else, as fewer did not.
+        """
+        return plausible_areas(distribution, hybrid_map, self._options.local_reach)
+
+    def end(self) -> None:
+        """Free the grids of the whole map, which take as much memory as a large building's submaps."""
+        self._grid_cache.clear()
