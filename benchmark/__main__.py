@@ -117,7 +117,8 @@ def _measure(options: argparse.Namespace) -> list[Report]:
         raise HmtSlamError("--write-docs is for the whole measurement: leave --set and --logs away, and --training")
     out = _create_report_folder(options)
     runner = Runner(out / "runs", options.jobs)
-    changes, seeds = tuple(options.set), tuple(range(options.seeds))
+    changes, first = tuple(options.set), options.first_seed
+    seeds = tuple(range(first, first + options.seeds))
     records = Records(options.runs or out / "runs", options.jobs)
     settings = Settings(
         options.logs,
@@ -129,7 +130,7 @@ def _measure(options: argparse.Namespace) -> list[Report]:
         records,
         options.training,
         options.minutes,
-        options.draw,
+        options.first_seed,
     )
     reports = []
     for kind in _list_kinds(options):
@@ -178,7 +179,7 @@ def _make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--seeds", type=_parse_count, default=0, metavar="N", help="seeds 0 to N-1; simulated: from 1000"
     )
-    parser.add_argument("--draw", type=_parse_seed, default=0, metavar="K", help="of mutants: seeds K to K+N-1")
+    parser.add_argument("--first-seed", type=_parse_seed, default=0, metavar="K", help="seeds K to K+N-1")
     parser.add_argument("--jobs", type=_parse_count, default=2, metavar="N", help="runs at the same time; 1 for speed")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report")
     parser.add_argument("--runs", type=Path, metavar="DIR", help="keeps simulated runs and starts, for later calls")

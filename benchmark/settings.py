@@ -28,7 +28,7 @@ class Settings:
     :ivar records: the same for simulated worlds.
     :ivar training: whether simulated worlds have training seeds instead of validation seeds.
     :ivar minutes: how long the nodes run in soak.
-    :ivar draw: the first seed of mutants.
+    :ivar first_seed: of the measurement's own choice; 0 for the usual one.
     """
 
     logs: tuple[str, ...]
@@ -40,7 +40,7 @@ class Settings:
     records: Records
     training: bool = False
     minutes: float = 60.0
-    draw: int = 0
+    first_seed: int = 0
 
     @property
     def configuration(self) -> Configuration:
@@ -53,12 +53,12 @@ class Settings:
 
     def seeds_or(self, count: int) -> tuple[int, ...]:
         """The selected seeds, by default the first ``count``."""
-        return self.seeds or tuple(range(count))
+        return self.seeds or tuple(range(self.first_seed, self.first_seed + count))
 
 
 def chosen_seeds(settings: Settings, count: int = SEEDS) -> tuple[int, ...]:
     """Training or validation seeds of simulated worlds, by default ``count`` of them."""
-    return seeds(len(settings.seeds_or(count)), training=settings.training)
+    return seeds(len(settings.seeds_or(count)), settings.first_seed, training=settings.training)
 
 
 def chosen_families(settings: Settings, families: tuple[str, ...], known: tuple[str, ...] = ()) -> tuple[str, ...]:

@@ -198,7 +198,7 @@ def test_another_draw_may_be_measured(monkeypatch, tmp_path):
     monkeypatch.setattr(measurement, "draw_mutants", lambda _modules, _count, seed: seeds.append(seed) or [])
     monkeypatch.setattr(measurement, "try_mutants", lambda mutants, _folder, _jobs: list(map(survive, mutants)))
     main(["mutants", "--out", str(tmp_path / "first")])
-    main(["mutants", "--draw", "3", "--seeds", "2", "--out", str(tmp_path / "others")])
+    main(["mutants", "--first-seed", "3", "--seeds", "2", "--out", str(tmp_path / "others")])
     assert seeds == [0, 3, 4]
 
 

@@ -49,6 +49,13 @@ def test_training_and_validation_have_no_seed_in_common():
         seeds(101, training=True)
 
 
+def test_seeds_that_nobody_looked_at_begin_where_they_are_asked_for():
+    assert seeds(3, 2000, training=False) == (2000, 2001, 2002)
+    assert seeds(2, 98, training=True) == (98, 99)
+    with pytest.raises(HmtSlamError, match="there are 100 training seeds: 101 are too many"):
+        seeds(3, 98, training=True)
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_family_has_a_world_of_a_length_that_is_feasible(family):
     assert 500 < open_simulated(World(family, 0).log).scan_count < 6000

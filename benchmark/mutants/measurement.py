@@ -3,7 +3,7 @@
 Each mutant is one fault in a copy of the repository. The tests near it run first, then all others that could notice it.
 A mutant that all of them pass survives. Where `equivalent.toml` has a reason why no result changes, it is not run, and
 counts as a survivor in the first figure. With ``--runs DIR`` verdicts are kept, and only survivors are tried again.
-``--draw K`` draws other mutants. Tests that were written for the survivors of one draw say little of the next.
+``--first-seed K`` draws other mutants. Tests that were written for the survivors of one draw say little of the next.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class OutcomeFile:
 
 def measure_mutants(settings: Settings) -> Report:
     """Try planted and drawn mutants, and list those that survive."""
-    seeds = tuple(settings.draw + seed for seed in settings.seeds_or(1))
+    seeds = settings.seeds_or(1)
     report = Report("mutants", "Faults of the numerical core that the unit tests notice", seeds=seeds)
     modules = _choose_modules(settings)
     drawn = [

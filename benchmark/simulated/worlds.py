@@ -59,14 +59,16 @@ class World:
         return f"{self.family}-{self.seed}"
 
 
-def seeds(count: int, *, training: bool) -> tuple[int, ...]:
-    """The first seeds for training or for validation.
+def seeds(count: int, first_seed: int = 0, *, training: bool) -> tuple[int, ...]:
+    """Seeds for training or for validation.
+
+    :param first_seed: the first of them; 0 for the usual one.
 
     :raises HmtSlamError: where there are fewer.
     """
-    if training and count > len(TRAINING_SEEDS):
-        raise HmtSlamError(f"there are {len(TRAINING_SEEDS)} training seeds: {count} are too many")
-    first = TRAINING_SEEDS.start if training else FIRST_VALIDATION_SEED
+    if training and first_seed + count > len(TRAINING_SEEDS):
+        raise HmtSlamError(f"there are {len(TRAINING_SEEDS)} training seeds: {first_seed + count} are too many")
+    first = first_seed or (TRAINING_SEEDS.start if training else FIRST_VALIDATION_SEED)
     return tuple(range(first, first + count))
 
 
