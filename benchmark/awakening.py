@@ -15,10 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from benchmark.localization import localization_probability
 from benchmark.logs import open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.settings import Settings
 from benchmark.simulated.records import Records, code_hash
+from benchmark.tail import POLICY as TAIL_POLICY
+from benchmark.tail import Pair, tail_requirement, tail_table
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
@@ -69,7 +72,9 @@ POLICY = (
     f"probability of {SURE:g}. It then drives {_ON:g} m more, else {FAR:g} m in all. Its pose is right within "
     f"{_RIGHT:g} m and {math.degrees(_RIGHT_ANGLE):.0f} degrees of the pose of this scan in the run over the whole "
     "log, relative to the nearest keyframe of the map. A confident wrong answer is a larger error at any time after "
-    "the localization. In grid every place exists several times, so that only wrong answers count."
+    "the localization. In grid every place exists several times, so that only wrong answers count. Above 0.9 counts "
+    "every start, in all logs, by the probability that the robot is where the most probable hypothesis has it, and by "
+    "its pose, at the scan of the first localization."
 )
 
 
@@ -81,12 +86,16 @@ class Awakening:
     :ivar found: path until the robot was localized, m; inf if it never was.
     :ivar right: whether its pose was right at the end of the path.
     :ivar wrong: whether it was localized at a wrong place at any time.
+    :ivar probability: of localization when it was localized first; 0 if it never was.
+    :ivar right_at_first: whether its pose was right then.
     """
 
     start: int
     found: float
     right: bool
     wrong: bool
+    probability: float
+    right_at_first: bool
 
     @property
     def good(self) -> bool:
@@ -119,7 +128,7 @@ def measure_awakening(settings: Settings) -> Report:
     report = Report("awakening", "Global localization in a saved map", seeds=(0,))
     configuration = settings.configuration
     names = settings.logs_or((*LOGS, *WORLDS))
-    rows = []
+    rows, first = [], list[Pair]()
     with open_logs([name for name in names if name not in WORLDS]) as logs:
         paths: dict[str, Path | str] = {name: f"{SIMULATION_PREFIX}{name},laps=2" for name in names if name in WORLDS}
         paths |= {log.name: log.path for log in logs}
@@ -130,13 +139,22 @@ def measure_awakening(settings: Settings) -> Report:
             ).items():
                 rows.append(_starts_row(name, kind, found))
                 report.data[f"{name}, {kind}"] = [asdict(start) for start in found]
+                first += first_localizations(found)
                 if found:
                     report.requirements += requirements(
                         f"{name}, map of the {kind}", found, is_distinguishable=name not in ALIKE
                     )
     columns = ["log", "map of the", "starts", f"right within {FAR:g} m", "m until known, mean", "median", "most"]
-    report.body += [table([*columns, "wrong", "not known"], rows), POLICY]
+    if first:
+        report.requirements.append(tail_requirement("first localizations", first))
+    tail = tail_table({"first localizations": first})
+    report.body += [table([*columns, "wrong", "not known"], rows), tail, POLICY, TAIL_POLICY]
     return report
+
+
+def first_localizations(found: Sequence[Awakening]) -> list[Pair]:
+    """The probability of localization of some starts when the robot was localized first, and whether it was right."""
+    return [(start.probability, start.right_at_first) for start in found if not math.isinf(start.found)]
 
 
 def complete_starts(
@@ -266,6 +284,7 @@ def try_start(log: MappedLog, start: int) -> Awakening:
     run = LockStepRun(log.configuration, state=log.state)
     run.lock_step.feed(PoseReset())
     found, right, wrong = math.inf, False, False
+    probability, right_at_first = 0.0, False
     travel, first = _path_lengths(log.truth[start:]), int(log.scans[start])
     counted, n = -_STEP, start
     for record in log.records[first:]:
@@ -279,10 +298,12 @@ def try_start(log: MappedLog, start: int) -> Awakening:
         counted = traveled
         now = _is_right(run, log.state.recorder.global_poses, true) if _is_localized(run) else None
         if now is not None:
+            if math.isinf(found):
+                probability, right_at_first = localization_probability(run), now
             found, right, wrong = min(found, traveled), now, wrong or not now
         if traveled >= min(FAR, found + _ON):
             break
-    return Awakening(start, found, right, wrong)
+    return Awakening(start, found, right, wrong, probability, right_at_first)
 
 
 def _is_localized(run: LockStepRun) -> bool:

@@ -17,6 +17,8 @@ from benchmark.report import Columns, Report, Requirement, mean, table, table_of
 from benchmark.settings import Settings, chosen_seeds, group_by_family, make_records
 from benchmark.simulated.closures import NEW, NOT_EXAMINED
 from benchmark.simulated.records import Record
+from benchmark.tail import POLICY as TAIL_POLICY
+from benchmark.tail import tail_requirement, tail_table
 
 RUNS = 300
 """Smallest number of runs."""
@@ -90,7 +92,11 @@ def measure_calibration(settings: Settings) -> Report:
         "arcs alone": [forecast_of_arcs(event) for event in events],
         "base rate": [forecast_of_base_rate(event, base) for event in events],
     }
-    report.requirements += _requirements(len(records), forecasts)
+    top = {"most probable answer": [forecast.top for forecast in live]}
+    report.requirements += [
+        *_requirements(len(records), forecasts),
+        *(tail_requirement(name, pairs) for name, pairs in top.items()),
+    ]
     bounds = interval(by_run, lambda some: reliability_of_top(some).error)
     by_family = {
         family: [forecast_of_hypotheses(event) for record in own for event in record["events"]]
@@ -104,7 +110,9 @@ def measure_calibration(settings: Settings) -> Report:
         table_of(
             [("family", lambda row: row[0]), ("runs", lambda row: str(counts[row[0]])), *_COLUMNS], by_family.items()
         ),
+        tail_table(top),
         POLICY,
+        TAIL_POLICY,
     ]
     report.data["forecasts"] = {name: [[f.right, *f.wrong] for f in own] for name, own in forecasts.items()}
     report.pictures["reliability.png"] = "Frequency against probability, with 95 % intervals; below, answers in a bin."

@@ -15,10 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmark.localization import localization_probability
 from benchmark.logs import open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
 from benchmark.settings import Settings
+from benchmark.tail import POLICY as TAIL_POLICY
+from benchmark.tail import Pair, tail_requirement, tail_table
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.evaluation import StampedPoses, evaluate_relations, true_relations
 from hmt_slam_ros.geometry import se2
@@ -59,7 +62,9 @@ POLICY = (
     f"{math.degrees(_RIGHT_ANGLE):.0f} degrees of the pose by the nearest keyframe of before, with {100 * _DRIFT:g} % "
     "of the distance to that added. Errors are those of metric SLAM's trajectory at relations within the parts before "
     "and after. False alarms are meters on which a robot that was not kidnapped is not localized. In hall and ring the "
-    "view after the kidnapping may be the same, or empty."
+    "view after the kidnapping may be the same, or empty. Above 0.9 counts every keyframe event after the kidnapping, "
+    "by the probability that the robot is where the most probable hypothesis has it, and by its pose. Events of a "
+    "drive depend on each other. The requirement leaves out hall and ring."
 )
 
 
@@ -73,6 +78,8 @@ class Kidnapping:
     :ivar wrong: whether it was sure of a wrong place at the end.
     :ivar errors: mean error of translation at relations before and after the kidnapping, m.
     :ivar driven: path after the kidnapping, m.
+    :ivar localizations: probability of localization at every keyframe event after the kidnapping, and whether its
+        estimate is right.
     """
 
     noticed: float
@@ -81,6 +88,7 @@ class Kidnapping:
     wrong: bool
     errors: tuple[float, float]
     driven: float
+    localizations: tuple[Pair, ...]
 
 
 def draw_drive(world: str, kind: str, seed: int) -> str:
@@ -105,11 +113,13 @@ class LocalizationReport(NamedTuple):
     :ivar traveled: path since the kidnapping, m.
     :ivar localized: as ``hmt/is_localized``.
     :ivar is_right: whether its estimate is right.
+    :ivar probability: of localization.
     """
 
     traveled: float
     localized: bool
     is_right: bool
+    probability: float
 
 
 class MonitoredRun:
@@ -184,7 +194,8 @@ class MonitoredRun:
         if not new or self.kidnap_event < 0:
             return None
         true = self.true[self.events - 1]
-        return LocalizationReport(traveled, self.is_localized(), self.is_right(true))
+        probability = localization_probability(self.run)
+        return LocalizationReport(traveled, self.is_localized(), self.is_right(true), probability)
 
 
 def leave_gap(records: Iterable[LogRecord], seconds: float) -> Iterator[LogRecord]:
@@ -256,7 +267,9 @@ def summarize_drive(reports: Sequence[LocalizationReport], errors: tuple[float, 
         if report.traveled > noticed and report.localized and not report.is_right
     ]
     last = reports[-1]
-    return Kidnapping(noticed, again, sum(wrong), last.localized and not last.is_right, errors, traveled)
+    wrong_at_end = last.localized and not last.is_right
+    localizations = tuple((report.probability, report.is_right) for report in reports)
+    return Kidnapping(noticed, again, sum(wrong), wrong_at_end, errors, traveled, localizations)
 
 
 def _error(own: StampedPoses, truth: StampedPoses, chosen: NDArray[np.bool_]) -> float:
@@ -318,7 +331,9 @@ def measure_kidnapping(settings: Settings) -> Report:
     head = ["world", "kidnapped to", "drives", f"noticed within {SOON:g} m", "m until noticed, median"]
     head += ["right at the end", "m until right, median", "m sure of a wrong place", "wrong at the end"]
     head += ["error before [m]", "after [m]"]
-    report.body.append(table(head, rows))
+    pairs = localizations_by_world([world for world, _, _ in cases], found)
+    report.requirements += [tail_requirement(name, own) for name, own in pairs.items() if name not in ALIKE]
+    report.body += [table(head, rows), tail_table(pairs)]
     rows = []
     for name in dict.fromkeys(name for name, _ in drives):
         drives_of_log = [
@@ -331,8 +346,20 @@ def measure_kidnapping(settings: Settings) -> Report:
         rows.append([name, str(len(drives_of_log)), f"{driven / 1e3:.2f}", f"{1e3 * unsure / driven:.1f}"])
         report.requirements.append(Requirement(f"{name}: m not sure of the place per km", 1e3 * unsure / driven, 0.0))
         report.data[f"{name} ordinary"] = [asdict(drive_scores) for drive_scores in drives_of_log]
-    report.body += [table(["ordinary drive", "drives", "km", "m not sure of the place per km"], rows), POLICY]
+    ordinary = table(["ordinary drive", "drives", "km", "m not sure of the place per km"], rows)
+    report.body += [ordinary, POLICY, TAIL_POLICY]
     return report
+
+
+def localizations_by_world(worlds: Sequence[str], found: Sequence[Kidnapping]) -> dict[str, list[Pair]]:
+    """The localizations of some drives, together except for those in worlds that look alike.
+
+    :param worlds: the world of each drive.
+    """
+    pairs: dict[str, list[Pair]] = {}
+    for world, drive in zip(worlds, found, strict=True):
+        pairs.setdefault(world if world in ALIKE else "other worlds", []).extend(drive.localizations)
+    return pairs
 
 
 def requirements(name: str, found: Sequence[Kidnapping]) -> list[Requirement]:

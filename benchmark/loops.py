@@ -12,6 +12,8 @@ from benchmark.simulated.loops import AWAY, GRACE, OLD, STAY, VIEW
 from benchmark.simulated.records import Record
 from benchmark.simulated.truth import FAR, NEAR, RADIUS, TOLERANCE, TURN
 from benchmark.simulated.worlds import LONG
+from benchmark.tail import POLICY as TAIL_POLICY
+from benchmark.tail import Pair, tail_requirement, tail_table
 
 MISSED = 0.05
 """Largest share of missed loops among those that could be closed."""
@@ -26,7 +28,7 @@ POLICY = (
     f"places, the robot stays on known ground for {STAY:g} m at least, and half of the keyframes of the first ten "
     f"meters share {100.0 * VIEW:.0f} % of their view with an earlier keyframe. It is closed in time if the definite "
     f"map joins the two places before {GRACE:g} m beyond the known ground; the distance is the path from the loop's "
-    "begin to that."
+    "begin to that. Above 0.9 counts every accepted closure, by the probability of its path when that was accepted."
 )
 
 WORLDS = ("nested",)
@@ -48,8 +50,10 @@ def measure_loops(settings: Settings) -> Report:
     report.requirements += [
         Requirement("closures accepted falsely", len(wrong), 0),
         Requirement("loops that could be closed and were not, share", missed_share(records), MISSED),
+        tail_requirement("accepted closures", acceptances(records)),
     ]
-    report.body += [_table(records), *([_wrong_table(wrong)] if wrong else []), POLICY]
+    tail = tail_table({"accepted closures": acceptances(records)})
+    report.body += [_table(records), *([_wrong_table(wrong)] if wrong else []), tail, POLICY, TAIL_POLICY]
     report.data["accepted"] = {record["world"]: record["accepted"] for record in records}
     report.data["loops"] = {record["world"]: record["loops"] for record in records}
     return report
@@ -91,6 +95,11 @@ def _table(records: list[Record]) -> str:
 def false_closures(records: Sequence[Record]) -> list[tuple[Record, Record]]:
     """The accepted closures that are false, each with the record of its run."""
     return [(record, closure) for record in records for closure in record["accepted"] if not closure["right"]]
+
+
+def acceptances(records: Sequence[Record]) -> list[Pair]:
+    """The probability of every closure when it was accepted, and whether it is right."""
+    return [(closure["probability"], closure["right"]) for record in records for closure in record["accepted"]]
 
 
 def _format_precision(records: Sequence[Record]) -> str:

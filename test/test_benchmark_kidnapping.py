@@ -12,6 +12,7 @@ from benchmark.kidnapping import (
     draw_drive,
     drive_kidnapped,
     leave_gap,
+    localizations_by_world,
     requirements,
     summarize_drive,
 )
@@ -23,7 +24,7 @@ LOST, RIGHT, WRONG = (False, False), (True, True), (True, False)
 
 def summarize(*states):
     return summarize_drive(
-        [LocalizationReport(float(k), *one) for k, one in enumerate(states)], (0.02, 0.03), float(len(states))
+        [LocalizationReport(float(k), *one, 0.95) for k, one in enumerate(states)], (0.02, 0.03), float(len(states))
     )
 
 
@@ -49,6 +50,11 @@ def test_a_confident_wrong_answer_and_one_that_comes_late_are_faults():
     ]
     assert met == [True, False]
     assert not requirements("office, known", [summarize(*[WRONG] * 7, LOST)])[0].is_met
+
+
+def test_localizations_of_worlds_that_look_alike_are_counted_apart():
+    found = localizations_by_world(["office", "ring", "busy"], [summarize(WRONG), summarize(LOST), summarize(RIGHT)])
+    assert found == {"other worlds": [(0.95, False), (0.95, True)], "ring": [(0.95, False)]}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -92,3 +98,4 @@ def test_a_kidnapping_is_detected_and_the_robot_relocalized(world, kind, seed):
     assert found.noticed <= SOON
     assert not found.wrong
     assert max(found.errors) < 0.1
+    assert found.localizations[-1] == (pytest.approx(1.0, abs=0.1), True)

@@ -21,7 +21,7 @@ from benchmark.calibration import (
     reliability_of_all,
     reliability_of_top,
 )
-from benchmark.loops import closing_distances, find_faults, missed_share
+from benchmark.loops import acceptances, closing_distances, find_faults, missed_share
 from benchmark.report import VALIDATION, Requirement, document_marks
 from benchmark.simulated.closures import NEW, NOT_EXAMINED
 
@@ -104,7 +104,7 @@ def record(loops=(), accepted=(), pending=(), arcs=(), poses=()):
     return {
         "world": "sim:nested,seed=1000",
         "loops": list(loops),
-        "accepted": [{"right": right} for right in accepted],
+        "accepted": [{"right": right, "probability": 0.99} for right in accepted],
         "pending": [{"right": right} for right in pending],
         "arcs": [{"nees": nees, "closure": False} for nees in arcs],
         "area_poses": [],
@@ -124,6 +124,10 @@ def test_a_topology_is_exact_without_false_closures_and_with_every_loop_closed()
     assert find_faults(record([loop(None)])) == ["loops not closed: 1"]
     assert find_faults(record([], [True, False])) == ["closures accepted falsely: 1"]
     assert find_faults(record([], [], [False])) == ["false closures pending: 1"]
+
+
+def test_every_accepted_closure_counts_by_its_probability():
+    assert acceptances([record(accepted=[True, False]), record()]) == [(0.99, True), (0.99, False)]
 
 
 def test_every_run_counts_the_same_for_the_mean_nees():
@@ -157,9 +161,12 @@ def test_all_is_measured_on_a_world_of_the_training_seeds(tmp_path, capsys):
     text = (out / "calibration.md").read_text()
     assert "| runs | 1 | at least 300 | FAIL |" in text
     assert "| ring | 1 |" in text
+    assert "most probable answer: expected calibration error above 0.9" in text
     assert (out / "reliability.png").stat().st_size > 10_000
     assert (out / "nees.png").stat().st_size > 10_000
-    assert "| ring | 1 |" in (out / "loops.md").read_text()
+    loops = (out / "loops.md").read_text()
+    assert "| ring | 1 |" in loops
+    assert "| accepted closures | " in loops
     assert "NEES of arcs, mean over runs" in (out / "consistency.md").read_text()
     assert main(["calibration", "--logs", "aces", "--seeds", "1", "--out", str(tmp_path / "other")]) == 2
     assert "no family 'aces'" in capsys.readouterr().err

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmark.awakening import FAR, map_log, try_start
+from benchmark.awakening import FAR, SURE, map_log, try_start
 from benchmark.kidnapping import SOON, drive_kidnapped
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
@@ -78,6 +78,8 @@ def test_it_is_recognized_where_it_is(maps, kind, share):
     found = try_start(log, log.starts[int(share * len(log.starts))])
     assert found.right
     assert not found.wrong
+    assert found.right_at_first
+    assert found.probability >= SURE
     assert found.found <= FAR
 
 
