@@ -167,6 +167,6 @@ def test_all_is_measured_on_a_world_of_the_training_seeds(tmp_path, capsys):
     loops = (out / "loops.md").read_text()
     assert "| ring | 1 |" in loops
     assert "| accepted closures | " in loops
-    assert "NEES of arcs, mean over runs" in (out / "consistency.md").read_text()
+    assert "NEES of arcs that closed a loop, mean over runs" in (out / "consistency.md").read_text()
     assert main(["calibration", "--logs", "aces", "--seeds", "1", "--out", str(tmp_path / "other")]) == 2
     assert "no family 'aces'" in capsys.readouterr().err
