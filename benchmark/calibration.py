@@ -345,10 +345,14 @@ def _nees_table(records: list[Record]) -> str:
 
 def _nees_by_family(records: list[Record]) -> str:
     head = ["family", *(word for kind in _REQUIRED for word in (f"NEES of {kind}", "99.9 %"))]
+    head += ["error of areas [m]", "runs with all areas within 99.9 %"]
     rows = []
     for family, own in group_by_family(records).items():
         pairs = [(mean_nees(own, KINDS[kind]), coverage(own, KINDS[kind], ALMOST_ALL)) for kind in _REQUIRED]
-        rows.append([family, *(cell for mean, share in pairs for cell in (f"{mean:.2f}", f"{100.0 * share:.1f} %"))])
+        cells = [cell for value, share in pairs for cell in (f"{value:.2f}", f"{100.0 * share:.1f} %")]
+        error = mean([area["translation"] for record in own for area in record["area_poses"]])
+        within = [all(area["nees"] <= ALMOST_ALL for area in record["area_poses"]) for record in own]
+        rows.append([family, *cells, f"{error:.3f}", f"{sum(within)} of {len(within)}"])
     return table(head, rows)
 
 
