@@ -22,8 +22,9 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.messages.documents import decode, encode
+from hmt_slam_ros.messages.documents import ResetRequest, ResetResponse, decode, encode
 from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.process_table import participant_names
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, MAP, ODOM, POSE, ROBOT_STATUS, SCAN, TFMessage
 from hmt_slam_ros.saved_map.folder import FORMAT, VERSION, FolderReader
@@ -147,6 +148,45 @@ def test_a_process_that_was_dead_while_the_others_restarted_restarts_too(corrido
     nodes.until(
         lambda: nodes.poses and np.abs(conversions.pose_from_message(nodes.poses[-1].pose.pose) - end).max() < 0.3
     )
+
+
+def test_a_reset_counts_answers_from_before_slam_was_known_to_those_who_answer(domain, listener, start):
+    slam = start("slam")
+    requests = [listener.subscribe(String, topics.RESET_REQUEST, topics.CHAIN) for _ in participant_names()]
+    client = listener.node.create_client(Trigger, "slam/reset")
+    listener.until(client.service_is_ready, alive=[slam])
+    requested = client.call_async(Trigger.Request())
+    listener.until(lambda: all(requests), alive=[slam])
+    number = decode(requests[0][0].data, ResetRequest).number
+    # While slam is stopped, DDS makes it known to nobody.
+    slam.send_signal(signal.SIGSTOP)
+    late = Listener(domain)
+    responses = late.node.create_publisher(String, topics.RESET_RESPONSE, topics.CHAIN)
+    for name in participant_names():
+        responses.publish(String(data=encode(ResetResponse(number, name))))
+    assert not responses.get_subscription_count()
+    slam.send_signal(signal.SIGCONT)
+    listener.until(requested.done, alive=[slam])
+    assert requested.result().success, requested.result().message
+    late.close()
+
+
+def test_a_process_that_is_killed_after_a_reset_answers_it_again_without_another_one(listener, start, tmp_path):
+    requests = listener.node.create_publisher(String, topics.RESET_REQUEST, topics.CHAIN)
+    responses = listener.subscribe(String, topics.RESET_RESPONSE, topics.CHAIN)
+    aam = start("aam", recovery=tmp_path)
+    listener.until(requests.get_subscription_count, alive=[aam])
+    for number in (1, 2):
+        requests.publish(String(data=encode(ResetRequest(number, 0, ""))))
+    listener.until(lambda: len(responses) == 2, alive=[aam])
+    kill(aam)
+    generations = {path.name for path in (tmp_path / "aam").iterdir()}
+    aam = start("aam", recovery=tmp_path)
+    listener.until(lambda: len(responses) == 3, alive=[aam])
+    answered = [decode(message.data, ResetResponse) for message in responses]
+    assert [(one.number, one.process, one.error) for one in answered] == [(k, "aam", "") for k in (1, 2, 2)]
+    # A reset starts another journal.
+    assert {path.name for path in (tmp_path / "aam").iterdir()} == generations
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")

@@ -105,7 +105,8 @@ class RequestCoordinator(ABC):
         self._requested_at, self._number = 0.0, 0
         self._responses: dict[str, SaveResponse | ResetResponse] = {}
         self._request_publisher = node.create_publisher(String, DOCUMENTS[request_type], topics.CHAIN)
-        subscribe_document(node, response_type, self._on_response, topics.VOLATILE_CHAIN)
+        # A process that just started may have answered before DDS has made this reader known to it.
+        subscribe_document(node, response_type, self._on_response, topics.CHAIN)
         node.create_timer(PERIOD, self._check_timeout, clock=node.diagnostics.steady_clock)
 
     @property

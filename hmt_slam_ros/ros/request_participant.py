@@ -67,8 +67,10 @@ class RequestParticipant:
             subscribe_document(node, kind, self._on_request, profile)
 
     def _on_request(self, request: SaveRequest | ResetRequest) -> None:
-        """Take a request, unless it is a reset that was answered before."""
-        if request.events > self._events + MAX_REACH:
+        """Take a request, unless it is a reset that was done before."""
+        if isinstance(request, ResetRequest) and request.number <= self._node.reset_number:
+            self._repeat_response(request)
+        elif request.events > self._events + MAX_REACH:
             self._node.diagnostics.refuse(
                 DOCUMENTS[type(request)],
                 HmtSlamError(
@@ -76,9 +78,14 @@ class RequestParticipant:
                     "in this ROS domain"
                 ),
             )
-        elif isinstance(request, SaveRequest) or request.number > self._node.reset_number:
+        else:
             self._requests.append(request)
             self.answer_due_requests()
+
+    def _repeat_response(self, request: ResetRequest) -> None:
+        """Answer the last reset again: the node may have been killed between that and its response."""
+        if request.number == self._node.reset_number:
+            self._respond(ResetResponse(request.number, self._name))
 
     def on_delivered(self, message: Message) -> None:
         """Count keyframe events, and answer the requests that wait for this one."""
