@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
-import multiprocessing
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 
@@ -17,9 +13,10 @@ from scipy.spatial import cKDTree
 
 from benchmark.localization import localization_probability
 from benchmark.logs import open_logs
+from benchmark.outcomes import OutcomesFile, fingerprint, map_shared
 from benchmark.report import Report, Requirement, table
 from benchmark.settings import Settings
-from benchmark.simulated.records import Records, code_hash
+from benchmark.simulated.records import Records
 from benchmark.tail import POLICY as TAIL_POLICY
 from benchmark.tail import Pair, tail_requirement, tail_table
 from hmt_slam_ros.arrays import Float64
@@ -54,20 +51,33 @@ FAR = 20.0
 SURE = 0.9
 RIGHT_SHARE = 0.95
 
+COLUMNS = (
+    "log",
+    "map of the",
+    "starts",
+    f"right within {FAR:g} m",
+    "m until known, mean",
+    "median",
+    "most",
+    "wrong",
+    "not known",
+)
+"""The head of a table of starts."""
+
 _RIGHT, _RIGHT_ANGLE = 1.0, math.radians(20.0)
 # m that the robot drives on once it is localized; smallest step that counts as travel, m, against noise.
 _ON, _STEP = 5.0, 0.1
 # Last part of the log that is left out, because the drive ends before 20 m.
 _LAST = 0.05
 # Largest distance of a keyframe to a place that a map contains, m, and path from a start that has to be contained, m.
-_HELD, _HELD_WAY = 2.0, 10.0
+HELD, HELD_WAY = 2.0, 10.0
 _DRAWS = 2008
 
 POLICY = (
     "The robot starts at random scans of a log without an initial pose, and repeats the drive of the log in one of two "
     "maps. The map of the whole log contains the very scans of the drive, which is easy. The map of the log's first "
     "half (in simulation, the first of two laps) is of another time: the robot starts in the second half, if a "
-    f"keyframe of the first is within {_HELD:g} m all along the first {_HELD_WAY:g} m of its path; after that it may "
+    f"keyframe of the first is within {HELD:g} m all along the first {HELD_WAY:g} m of its path; after that it may "
     "leave the map. ACES has no such place. The robot is localized if the hypotheses that are not lost have a "
     f"probability of {SURE:g}. It then drives {_ON:g} m more, else {FAR:g} m in all. Its pose is right within "
     f"{_RIGHT:g} m and {math.degrees(_RIGHT_ANGLE):.0f} degrees of the pose of this scan in the run over the whole "
@@ -88,6 +98,7 @@ class Awakening:
     :ivar wrong: whether it was localized at a wrong place at any time.
     :ivar probability: of localization when it was localized first; 0 if it never was.
     :ivar right_at_first: whether its pose was right then.
+    :ivar off: largest distance of a wrong pose with which it was localized, m; 0 without one.
     """
 
     start: int
@@ -96,6 +107,7 @@ class Awakening:
     wrong: bool
     probability: float
     right_at_first: bool
+    off: float
 
     @property
     def good(self) -> bool:
@@ -137,18 +149,17 @@ def measure_awakening(settings: Settings) -> Report:
             for kind, found in complete_starts(
                 name, paths[name], configuration, settings.changes, count, records
             ).items():
-                rows.append(_starts_row(name, kind, found))
+                rows.append(starts_row(name, kind, found))
                 report.data[f"{name}, {kind}"] = [asdict(start) for start in found]
                 first += first_localizations(found)
                 if found:
                     report.requirements += requirements(
                         f"{name}, map of the {kind}", found, is_distinguishable=name not in ALIKE
                     )
-    columns = ["log", "map of the", "starts", f"right within {FAR:g} m", "m until known, mean", "median", "most"]
     if first:
         report.requirements.append(tail_requirement("first localizations", first))
     tail = tail_table({"first localizations": first})
-    report.body += [table([*columns, "wrong", "not known"], rows), tail, POLICY, TAIL_POLICY]
+    report.body += [table(COLUMNS, rows), tail, POLICY, TAIL_POLICY]
     return report
 
 
@@ -164,7 +175,7 @@ def complete_starts(
 
     :param changes: parameters of the configuration that differ from the file.
     """
-    file = StartsFile(records.folder / f"awakening-{name}-{_fingerprint(changes)}.json")
+    file = StartsFile(records.folder / f"awakening-{name}-{fingerprint(changes, Path(__file__))}.json")
     file.complete(path, configuration, count, records.jobs)
     return file.starts(count)
 
@@ -183,27 +194,58 @@ def requirements(name: str, found: Sequence[Awakening], *, is_distinguishable: b
 def map_log(path: Path | str, configuration: Configuration) -> dict[str, MappedLog]:
     """The maps of a whole log and of its first half, {kind: map}."""
     records = list(open_log(path).records())
-    scans = np.array([n for n, record in enumerate(records) if isinstance(record.measurement, Scan)])
-    middle, last = len(scans) // 2, int((1.0 - _LAST) * len(scans))
-    half = _process_records(LockStepRun(configuration), records[: scans[middle]]).state
-    run = _process_records(LockStepRun(configuration, state=half), records[scans[middle] :])
+    scans = scan_records(records)
+    middle, last = len(scans) // 2, last_start(len(scans))
+    half = process_records(LockStepRun(configuration), records[: scans[middle]]).state
+    run = process_records(LockStepRun(configuration, state=half), records[scans[middle] :])
     whole, result = run.state, run.finish()
     truth = result.recorder.finish(result.log_progress.stamps).trajectory
+    easy = MappedLog(configuration, records, whole, scans, truth, range(last))
+    return dict(zip(KINDS, (easy, in_map_of_part(easy, half, range(middle, last))), strict=True))
+
+
+def in_map_of_part(whole: MappedLog, state: RunState, starts: Sequence[int], way: float = HELD_WAY) -> MappedLog:
+    """The drive of a log in the map of a part of it, with those starts that stay on its ground.
+
+    :param whole: the same in the map of the whole log.
+    :param state: the map of the part.
+    :param starts: numbers of scans outside of the part.
+    :param way: path from a start that has to be on the map's ground, m.
+    """
+    records, scans, truth = whole.records, whole.scans, whole.truth
     numbers = {records[scan].measurement.stamp: n for n, scan in enumerate(scans)}
-    pose_of_scan = {numbers[stamp]: pose for stamp, pose in _keyframes(half).items()}
+    pose_of_scan = {numbers[stamp]: pose for stamp, pose in _keyframes(state).items()}
     known_scans, poses = np.array(list(pose_of_scan)), np.array(list(pose_of_scan.values()))
     distances, nearest = cKDTree(truth[known_scans, :2]).query(truth[:, :2])
-    in_half = se2.compose(poses[nearest], se2.between(truth[known_scans[nearest]], truth))
-    travel = np.array(list(_path_lengths(truth)))
-    ends = np.searchsorted(travel, travel + _HELD_WAY)
-    starts_in_half = [n for n in range(middle, last) if (distances[n : ends[n]] <= _HELD).all()]
-    easy = MappedLog(configuration, records, whole, scans, truth, range(last))
-    return dict(
-        zip(KINDS, (easy, MappedLog(configuration, records, half, scans, in_half, starts_in_half)), strict=True)
-    )
+    in_part = se2.compose(poses[nearest], se2.between(truth[known_scans[nearest]], truth))
+    known = stays_within(distances, truth, HELD, way)
+    return MappedLog(whole.configuration, records, state, scans, in_part, [n for n in starts if known[n]])
 
 
-def _process_records(run: LockStepRun, records: Sequence[LogRecord]) -> LockStepRun:
+def stays_within(distances: Float64, truth: Float64, limit: float, way: float) -> NDArray[np.bool_]:
+    """Whether the distances along a drive are within a limit from each scan on, shape (n,).
+
+    :param distances: shape (n,), m.
+    :param truth: shape (n, 3), poses of the scans.
+    :param way: path along which they have to be, m.
+    """
+    travel = np.array(list(path_lengths(truth)))
+    ends = np.searchsorted(travel, travel + way)
+    return np.array([bool((distances[n:end] <= limit).all()) for n, end in enumerate(ends)])
+
+
+def scan_records(records: Sequence[LogRecord]) -> NDArray[np.int64]:
+    """The numbers (n,) of the records that are scans."""
+    return np.array([n for n, record in enumerate(records) if isinstance(record.measurement, Scan)])
+
+
+def last_start(scans: int) -> int:
+    """The number of the scan after which no robot starts, because the drive ends too soon."""
+    return int((1.0 - _LAST) * scans)
+
+
+def process_records(run: LockStepRun, records: Sequence[LogRecord]) -> LockStepRun:
+    """The run after some records."""
     for record in records:
         run.process_record(record)
     return run
@@ -221,7 +263,7 @@ def _keyframes(state: RunState) -> dict[int, Float64]:
     }
 
 
-def _path_lengths(poses: Float64) -> Iterator[float]:
+def path_lengths(poses: Float64) -> Iterator[float]:
     """Path length up to each of the poses (n, 3), m."""
     total, last = 0.0, poses[0]
     for pose in poses:
@@ -231,19 +273,12 @@ def _path_lengths(poses: Float64) -> Iterator[float]:
         yield total
 
 
-class StartsFile:
-    """The file of the starts of a log, from which an interrupted measurement continues.
-
-    :ivar file: with a line for each start: the kind of its map and the fields of :class:`Awakening`.
-    """
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
+class StartsFile(OutcomesFile):
+    """The file of the starts of a log: of each, the kind of its map and the fields of :class:`Awakening`."""
 
     def starts(self, count: int) -> dict[str, list[Awakening]]:
         """The first ``count`` starts in each map, as many as there are."""
-        lines = self.file.read_text(encoding="utf-8").splitlines() if self.file.is_file() else []
-        rows = [json.loads(line) for line in lines]
+        rows = self.rows()
         return {kind: [Awakening(*row[1:]) for row in rows if row[0] == kind][:count] for kind in KINDS}
 
     def complete(self, path: Path | str, configuration: Configuration, count: int, jobs: int) -> None:
@@ -251,32 +286,11 @@ class StartsFile:
         made = {kind: len(start) for kind, start in self.starts(count).items()}
         if min(made.values()) >= count:
             return
-        self.file.parent.mkdir(parents=True, exist_ok=True)
         for kind, log in map_log(path, configuration).items():
             drawn = np.random.default_rng(_DRAWS).integers(0, max(1, len(log.starts)), count).tolist()
             starts = [log.starts[n] for n in drawn if log.starts]
-            # Forked processes share the map.
-            with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork"), _set_log, (log,)) as pool:
-                for start in pool.map(_try_start, starts[made[kind] :]):
-                    with self.file.open("a", encoding="utf-8") as target:
-                        target.write(json.dumps([kind, *astuple(start)]) + "\n")
-
-
-def _fingerprint(changes: Sequence[str]) -> str:
-    """A hash of this code and the changed parameters, which names the file of the starts."""
-    own = hashlib.sha256("\n".join([code_hash(), *changes]).encode() + Path(__file__).read_bytes())
-    return own.hexdigest()[:16]
-
-
-_LOG: list[MappedLog] = []
-
-
-def _set_log(log: MappedLog) -> None:
-    _LOG.append(log)
-
-
-def _try_start(start: int) -> Awakening:
-    return try_start(_LOG[-1], start)
+            for start in map_shared(try_start, log, starts[made[kind] :], jobs):
+                self.add([kind, *astuple(start)])
 
 
 def try_start(log: MappedLog, start: int) -> Awakening:
@@ -284,8 +298,8 @@ def try_start(log: MappedLog, start: int) -> Awakening:
     run = LockStepRun(log.configuration, state=log.state)
     run.lock_step.feed(PoseReset())
     found, right, wrong = math.inf, False, False
-    probability, right_at_first = 0.0, False
-    travel, first = _path_lengths(log.truth[start:]), int(log.scans[start])
+    probability, right_at_first, off = 0.0, False, 0.0
+    travel, first = path_lengths(log.truth[start:]), int(log.scans[start])
     counted, n = -_STEP, start
     for record in log.records[first:]:
         run.process_record(record)
@@ -296,14 +310,16 @@ def try_start(log: MappedLog, start: int) -> Awakening:
         if traveled < counted + _STEP:
             continue
         counted = traveled
-        now = _is_right(run, log.state.recorder.global_poses, true) if _is_localized(run) else None
-        if now is not None:
+        error = _pose_error(run, log.state.recorder.global_poses, true) if _is_localized(run) else None
+        if error is not None:
+            right = _is_right(error)
             if math.isinf(found):
-                probability, right_at_first = localization_probability(run), now
-            found, right, wrong = min(found, traveled), now, wrong or not now
+                probability, right_at_first = localization_probability(run), right
+            found, wrong = min(found, traveled), wrong or not right
+            off = off if right else max(off, math.hypot(error[0], error[1]))
         if traveled >= min(FAR, found + _ON):
             break
-    return Awakening(start, found, right, wrong, probability, right_at_first)
+    return Awakening(start, found, right, wrong, probability, right_at_first, off)
 
 
 def _is_localized(run: LockStepRun) -> bool:
@@ -317,8 +333,8 @@ def _is_localized(run: LockStepRun) -> bool:
     )
 
 
-def _is_right(run: LockStepRun, before: Sequence[AreaPose], true: Float64) -> bool | None:
-    """Whether the last estimate is near the truth; None if its area was merged with another since.
+def _pose_error(run: LockStepRun, before: Sequence[AreaPose], true: Float64) -> Float64 | None:
+    """The last estimate in the frame of the true pose, shape (3,); None if its area was merged with another since.
 
     :param before: poses of the areas in the saved map.
     :param true: ``map_T_base``, shape (3,).
@@ -333,11 +349,15 @@ def _is_right(run: LockStepRun, before: Sequence[AreaPose], true: Float64) -> bo
     area = complete_area_poses(slam.replica.maps[slam.replica.best_hypothesis], global_poses).get(last.area)
     if area is None:
         return None
-    error = se2.between(true, se2.compose(area.mean, last.pose.mean))
+    return se2.between(true, se2.compose(area.mean, last.pose.mean))
+
+
+def _is_right(error: Float64) -> bool:
     return bool(math.hypot(error[0], error[1]) <= _RIGHT and abs(error[2]) <= _RIGHT_ANGLE)
 
 
-def _starts_row(name: str, kind: str, found: Sequence[Awakening]) -> list[str]:
+def starts_row(name: str, kind: str, found: Sequence[Awakening]) -> list[str]:
+    """The line of the starts in one map, with the cells of ``COLUMNS``."""
     distances = [start.found for start in found if start.right]
     share = f"{np.mean([start.good for start in found]):.2f}" if found else "-"
     figures = (f"{statistic(distances):.1f}" if distances else "-" for statistic in (np.mean, np.median, max))

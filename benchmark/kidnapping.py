@@ -8,14 +8,21 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
-from itertools import pairwise, repeat
+from itertools import repeat
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmark.localization import localization_probability
+from benchmark.kidnapped_drive import (
+    DRIFT,
+    RIGHT,
+    RIGHT_ANGLE,
+    Kidnapping,
+    LocalizationReport,
+    MonitoredRun,
+    summarize_drive,
+)
 from benchmark.logs import open_logs
 from benchmark.report import Report, Requirement, table
 from benchmark.runs import PARAMETERS
@@ -27,11 +34,8 @@ from hmt_slam_ros.evaluation import StampedPoses, evaluate_relations, true_relat
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.records import SIMULATION_PREFIX, LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.metric_slam.slam import MetricSlam
-from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 WORLDS = ("office", "busy", "nested", "hall", "ring")
 LOGS = ("aces", "intel")
@@ -44,7 +48,6 @@ SEEDS = 10
 SOON, SHARE = 5.0, 0.95
 """Path within which a kidnapping has to be detected, m, and smallest share of the cases."""
 
-_RIGHT, _RIGHT_ANGLE, _DRIFT = 0.5, math.radians(10.0), 0.03
 _DRAWS = 2009
 _JUMP = 0.6  # m and rad, in the time between two scans
 _STEP = 2.5  # m, by which a robot is moved in short kidnappings
@@ -58,37 +61,14 @@ POLICY = (
     f"second round to another part of it (known), in the first one to unmapped ground (unknown), or {_STEP:g} m "
     f"farther on its route (short); or as in known, with {_GAP:g} s without scans (gap). "
     "The kidnapping is noticed when the robot is not localized, or right. A robot is sure while hmt/is_localized "
-    f"says so. It is right within {_RIGHT:g} m and "
-    f"{math.degrees(_RIGHT_ANGLE):.0f} degrees of the pose by the nearest keyframe of before, with {100 * _DRIFT:g} % "
+    f"says so. It is right within {RIGHT:g} m and "
+    f"{math.degrees(RIGHT_ANGLE):.0f} degrees of the pose by the nearest keyframe of before, with {100 * DRIFT:g} % "
     "of the distance to that added. Errors are those of metric SLAM's trajectory at relations within the parts before "
     "and after. False alarms are meters on which a robot that was not kidnapped is not localized. In hall and ring the "
     "view after the kidnapping may be the same, or empty. Above 0.9 counts every keyframe event after the kidnapping, "
     "by the probability that the robot is where the most probable hypothesis has it, and by its pose. Events of a "
     "drive depend on each other. The requirement leaves out hall and ring."
 )
-
-
-@dataclass(frozen=True)
-class Kidnapping:
-    """The scores of one drive.
-
-    :ivar noticed: path until the robot was not localized, or right again, m; inf if it never was.
-    :ivar again: path until it was sure of the right place and stayed so, m; inf if it never was.
-    :ivar confident: path after the detection on which it was sure of a wrong place, m.
-    :ivar wrong: whether it was sure of a wrong place at the end.
-    :ivar errors: mean error of translation at relations before and after the kidnapping, m.
-    :ivar driven: path after the kidnapping, m.
-    :ivar localizations: probability of localization at every keyframe event after the kidnapping, and whether its
-        estimate is right.
-    """
-
-    noticed: float
-    again: float
-    confident: float
-    wrong: bool
-    errors: tuple[float, float]
-    driven: float
-    localizations: tuple[Pair, ...]
 
 
 def draw_drive(world: str, kind: str, seed: int) -> str:
@@ -105,97 +85,6 @@ def draw_drive(world: str, kind: str, seed: int) -> str:
     else:
         to = random.uniform(*_TO[kind])
     return f"{name},carried={at:.4f},to={to:.4f},turned={turned:.1f}"
-
-
-class LocalizationReport(NamedTuple):
-    """The localization of a robot at a keyframe event.
-
-    :ivar traveled: path since the kidnapping, m.
-    :ivar localized: as ``hmt/is_localized``.
-    :ivar is_right: whether its estimate is right.
-    :ivar probability: of localization.
-    """
-
-    traveled: float
-    localized: bool
-    is_right: bool
-    probability: float
-
-
-class MonitoredRun:
-    """A run with the truth, which reports its localization.
-
-    :ivar run: the five processes.
-    :ivar true: {keyframe event: ``world_T_base`` (3,)}.
-    :ivar kidnap_event: the first keyframe event after the kidnapping, -1 before.
-    """
-
-    def __init__(self, changes: Sequence[str] = ()) -> None:
-        """:param changes: parameters that differ from the file, as ``name=value``."""
-        self.run = LockStepRun(load_configuration(PARAMETERS, list(changes)))
-        self.true: dict[int, NDArray[np.float64]] = {}
-        self.kidnap_event = -1
-        self._truth: dict[int, NDArray[np.float64]] = {}
-
-    @property
-    def events(self) -> int:
-        """Number of keyframe events."""
-        return len(self.run.recorder.keyframes)
-
-    def is_localized(self) -> bool:
-        """As ``hmt/is_localized``."""
-        tsbi = self.run.lock_step.processes["tsbi"]
-        assert isinstance(tsbi, Tsbi)
-        return tsbi.localization.localized
-
-    def is_right(self, true: NDArray[np.float64]) -> bool:
-        """Whether the last estimate agrees with the map of before the kidnapping.
-
-        :param true: ``world_T_base``, shape (3,).
-        """
-        slam, last = self.run.lock_step.processes["slam"], self.run.recorder.last_estimate
-        assert isinstance(slam, MetricSlam)
-        hybrid_map, areas = slam.replica.maps[slam.replica.best_hypothesis], self._areas()
-        if last is None or last.area not in areas:
-            return False
-        keyframe_poses = {
-            keyframe: se2.compose(areas[area], pose)
-            for area in hybrid_map.area_ids()
-            for keyframe, pose in hybrid_map.keyframes(area).items()
-            if keyframe < self.kidnap_event and area in areas
-        }
-        distances = {k: math.hypot(*(self.true[k] - true)[:2]) for k in keyframe_poses}
-        nearest = min(distances, key=lambda k: distances[k])
-        expected = se2.compose(keyframe_poses[nearest], se2.between(self.true[nearest], true))
-        error = se2.between(expected, se2.compose(areas[last.area], last.pose.mean))
-        near = math.hypot(error[0], error[1]) <= _RIGHT + _DRIFT * distances[nearest]
-        return bool(near and abs(error[2]) <= _RIGHT_ANGLE)
-
-    def _areas(self) -> dict[int, NDArray[np.float64]]:
-        """{area: ``map_T_area``, shape (3,)} of the last closure decision with poses."""
-        decisions = self.run.recorder.decisions
-        for sequence in sorted(decisions, reverse=True):
-            if decisions[sequence].global_poses:
-                return {entry.area: entry.pose.mean for entry in decisions[sequence].global_poses}
-        return {}
-
-    def report(self, stamp: int, true: NDArray[np.float64], traveled: float) -> LocalizationReport | None:
-        """The report at a keyframe event after the kidnapping; None for other scans.
-
-        Scans may have waited for odometry, so there may be several events since the last scan.
-
-        :param stamp: of the scan, ns.
-        :param true: ``world_T_base``, shape (3,), at the scan.
-        """
-        self._truth[stamp] = true
-        new = range(len(self.true), self.events)
-        for event in new:
-            self.true[event] = self._truth[self.run.recorder.keyframes[event].scan.stamp]
-        if not new or self.kidnap_event < 0:
-            return None
-        true = self.true[self.events - 1]
-        probability = localization_probability(self.run)
-        return LocalizationReport(traveled, self.is_localized(), self.is_right(true), probability)
 
 
 def leave_gap(records: Iterable[LogRecord], seconds: float) -> Iterator[LogRecord]:
@@ -223,7 +112,7 @@ def drive_kidnapped(name: str, changes: Sequence[str] = (), gap: float = 0.0) ->
 
     :param gap: time without scans from the kidnapping on, s.
     """
-    monitored, traveled = MonitoredRun(changes), 0.0
+    monitored, traveled = MonitoredRun(load_configuration(PARAMETERS, list(changes))), 0.0
     reports: list[LocalizationReport] = []
     stamps, truth, parts = list[int](), list[NDArray[np.float64]](), list[bool]()
     for record in leave_gap(open_log(name).records(), gap):
@@ -248,30 +137,6 @@ def drive_kidnapped(name: str, changes: Sequence[str] = (), gap: float = 0.0) ->
     return summarize_drive(reports, (errors[0], errors[1]), traveled)
 
 
-def summarize_drive(reports: Sequence[LocalizationReport], errors: tuple[float, float], traveled: float) -> Kidnapping:
-    """The scores of a drive.
-
-    :param reports: after the kidnapping, at least one.
-    :param errors: before and after the kidnapping, m.
-    :param traveled: path after the kidnapping, m.
-    """
-    noticed = next((report.traveled for report in reports if not report.localized or report.is_right), math.inf)
-    again = math.inf
-    for report in reversed(reports):
-        if not (report.localized and report.is_right):
-            break
-        again = report.traveled
-    wrong = [
-        later.traveled - report.traveled
-        for report, later in pairwise(reports)
-        if report.traveled > noticed and report.localized and not report.is_right
-    ]
-    last = reports[-1]
-    wrong_at_end = last.localized and not last.is_right
-    localizations = tuple((report.probability, report.is_right) for report in reports)
-    return Kidnapping(noticed, again, sum(wrong), wrong_at_end, errors, traveled, localizations)
-
-
 def _error(own: StampedPoses, truth: StampedPoses, chosen: NDArray[np.bool_]) -> float:
     """Mean error at the relations of a part of a drive, m."""
     part = StampedPoses(truth.stamps[chosen], truth.poses[chosen])
@@ -292,7 +157,7 @@ class OrdinaryDrive:
 
 def drive_ordinary(path: Path | str, changes: Sequence[str] = ()) -> OrdinaryDrive:
     """Drive without a kidnapping."""
-    monitored, driven, unsure = MonitoredRun(changes), 0.0, 0.0
+    monitored, driven, unsure = MonitoredRun(load_configuration(PARAMETERS, list(changes))), 0.0, 0.0
     for record in open_log(path).records():
         before = monitored.events
         monitored.run.process_record(record)

@@ -1,21 +1,25 @@
 """Scores of kidnapped robots by their localization."""
 
+import itertools
 import math
+from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
+from benchmark.kidnapped_drive import LocalizationReport, MonitoredRun, summarize_drive
 from benchmark.kidnapping import (
     KINDS,
     SOON,
-    LocalizationReport,
     draw_drive,
     drive_kidnapped,
     leave_gap,
     localizations_by_world,
     requirements,
-    summarize_drive,
 )
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Scan
 
@@ -55,6 +59,26 @@ def test_a_confident_wrong_answer_and_one_that_comes_late_are_faults():
 def test_localizations_of_worlds_that_look_alike_are_counted_apart():
     found = localizations_by_world(["office", "ring", "busy"], [summarize(WRONG), summarize(LOST), summarize(RIGHT)])
     assert found == {"other worlds": [(0.95, False), (0.95, True)], "ring": [(0.95, False)]}
+
+
+def test_the_pose_counts_in_the_area_that_the_robot_is_in_after_the_event():
+    monitored = MonitoredRun(Configuration())
+    for record in itertools.islice(open_log("sim:ring,seed=1").records(), 200):
+        monitored.run.process_record(record)
+        if isinstance(record.measurement, Scan):
+            monitored.report(record.measurement.stamp, record.true_pose, 0.0)
+    monitored.kidnap_event, recorder = monitored.events, monitored.run.recorder
+    event = max(recorder.hypotheses)
+    (estimate,), (hypothesis,) = recorder.keyframes[event].estimates, recorder.hypotheses[event].hypotheses
+    true = monitored.true[event]
+    assert monitored.estimate_error(true).is_right
+    frame = PoseGaussian.from_pose(np.array([1.0, 2.0, 0.5]))
+    estimate = replace(estimate, area=7, pose=frame.inverse().compose(estimate.pose))
+    recorder.keyframes[event] = replace(recorder.keyframes[event], estimates=(estimate,))
+    assert not monitored.estimate_error(true).is_right
+    hypothesis = replace(hypothesis, frame_change=frame)
+    recorder.hypotheses[event] = replace(recorder.hypotheses[event], hypotheses=(hypothesis,))
+    assert monitored.estimate_error(true).is_right
 
 
 @pytest.mark.parametrize("kind", KINDS)

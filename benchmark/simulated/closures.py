@@ -13,8 +13,8 @@ from hmt_slam_ros.messages.map_changes import Arc
 from hmt_slam_ros.messages.messages import Hypotheses, Hypothesis
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 
-# Newest keyframes of the robot's area that are compared with a known area.
-_RECENT = 5
+RECENT = 5
+"""Newest keyframes of the robot's area that are compared with a known area."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class Paths:
         moved_keyframes = {
             r.keyframe: r.pose for r in hypothesis.moved_keyframes if r.area == known_area and r.previous_area != r.area
         }
-        recent_keyframes = examination.keyframes if examination else list(before.keyframes(other))[-_RECENT:]
+        recent_keyframes = examination.keyframes if examination else list(before.keyframes(other))[-RECENT:]
         recent_poses = {
             k: se2.compose(pose.mean, at) for k, at in before.keyframes(other).items() if k in recent_keyframes
         }

@@ -75,6 +75,30 @@ class PlacementError(NamedTuple):
         return self.same_place and self.rotation <= TURN and (self.translation <= NEAR or admitted)
 
 
+def placement_error(
+    pair: tuple[int, int], poses: tuple[Pose, Pose], true: Pose, placement: PoseGaussian, *, same_place: bool
+) -> PlacementError:
+    """The error of a placement, between two keyframes.
+
+    :param pair: the two, the known one first.
+    :param poses: ``area_T_base`` of both in the known area, each of shape (3,).
+    :param true: pose of the second in the frame of the first, shape (3,).
+    :param placement: belief over ``area_T_origin``, where the second keyframe is fixed to the origin.
+    :param same_place: whether the two are in the same place.
+    """
+    error = se2.between(se2.between(*poses), true)
+    moved = PoseGaussian(se2.between(placement.mean, poses[1]), np.zeros((3, 3)))
+    xi = se2.log(error)
+    return PlacementError(
+        pair,
+        float(np.hypot(true[0], true[1])),
+        same_place,
+        float(np.hypot(error[0], error[1])),
+        float(np.degrees(abs(error[2]))),
+        float(xi @ np.linalg.solve(placement.compose(moved).covariance + _WITHIN_AREAS, xi)),
+    )
+
+
 class Truth:
     """The truth about the keyframes of a run.
 
@@ -127,24 +151,9 @@ class Truth:
         same = self.same_place(list(known), list(query), (1.0 + TOLERANCE) * RADIUS)
         # A wall may be between the nearest two.
         k, m = np.unravel_index(np.argmin(np.where(same, apart, apart + 1e6)), apart.shape)
-        ours, theirs = list(known.values())[k], list(query.values())[m]
-        estimated = se2.between(ours, theirs)
-        error = se2.between(estimated, se2.between(true_known[k], true_asked[m]))
-        spread = (
-            PoseGaussian(origin, covariance)
-            .compose(PoseGaussian(se2.between(origin, theirs), np.zeros((3, 3))))
-            .covariance
-            + _WITHIN_AREAS
-        )
-        xi = se2.log(error)
-        return PlacementError(
-            (list(known)[k], list(query)[m]),
-            float(apart[k, m]),
-            bool(same[k, m]),
-            float(np.hypot(error[0], error[1])),
-            float(np.degrees(abs(error[2]))),
-            float(xi @ np.linalg.solve(spread, xi)),
-        )
+        pair, poses = (list(known)[k], list(query)[m]), (list(known.values())[k], list(query.values())[m])
+        true = se2.between(true_known[k], true_asked[m])
+        return placement_error(pair, poses, true, PoseGaussian(origin, covariance), same_place=bool(same[k, m]))
 
     def _stamps(self, keyframes: Sequence[int]) -> NDArray[np.int64]:
         return np.array([self.stamps[keyframe] for keyframe in keyframes], dtype=np.int64)
