@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, astuple, dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,6 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs import LogRecord
 from hmt_slam_ros.logs.records import SIMULATION_PREFIX
-from hmt_slam_ros.messages.map_changes import AreaPose
 from hmt_slam_ros.messages.messages import PoseReset
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.metric_slam.slam import MetricSlam
@@ -134,6 +134,11 @@ class MappedLog:
     truth: Float64
     starts: Sequence[int]
 
+    @cached_property
+    def numbers(self) -> dict[int, int]:
+        """{stamp of a scan: its number}."""
+        return {self.records[scan].measurement.stamp: n for n, scan in enumerate(self.scans)}
+
 
 def measure_awakening(settings: Settings) -> Report:
     """Map the logs, and localize the robot from starts in them."""
@@ -213,8 +218,7 @@ def in_map_of_part(whole: MappedLog, state: RunState, starts: Sequence[int], way
     :param way: path from a start that has to be on the map's ground, m.
     """
     records, scans, truth = whole.records, whole.scans, whole.truth
-    numbers = {records[scan].measurement.stamp: n for n, scan in enumerate(scans)}
-    pose_of_scan = {numbers[stamp]: pose for stamp, pose in _keyframes(state).items()}
+    pose_of_scan = {whole.numbers[stamp]: pose for stamp, pose in _keyframes(state).items()}
     known_scans, poses = np.array(list(pose_of_scan)), np.array(list(pose_of_scan.values()))
     distances, nearest = cKDTree(truth[known_scans, :2]).query(truth[:, :2])
     in_part = se2.compose(poses[nearest], se2.between(truth[known_scans[nearest]], truth))
@@ -300,17 +304,16 @@ def try_start(log: MappedLog, start: int) -> Awakening:
     found, right, wrong = math.inf, False, False
     probability, right_at_first, off = 0.0, False, 0.0
     travel, first = path_lengths(log.truth[start:]), int(log.scans[start])
-    counted, n = -_STEP, start
+    counted = -_STEP
     for record in log.records[first:]:
         run.process_record(record)
         if not isinstance(record.measurement, Scan):
             continue
-        traveled, true = next(travel), log.truth[n]
-        n += 1
+        traveled = next(travel)
         if traveled < counted + _STEP:
             continue
         counted = traveled
-        error = _pose_error(run, log.state.recorder.global_poses, true) if _is_localized(run) else None
+        error = _pose_error(run, log) if _is_localized(run) else None
         if error is not None:
             right = _is_right(error)
             if math.isinf(found):
@@ -333,23 +336,22 @@ def _is_localized(run: LockStepRun) -> bool:
     )
 
 
-def _pose_error(run: LockStepRun, before: Sequence[AreaPose], true: Float64) -> Float64 | None:
-    """The last estimate in the frame of the true pose, shape (3,); None if its area was merged with another since.
+def _pose_error(run: LockStepRun, log: MappedLog) -> Float64 | None:
+    """The last estimate in the frame of the true pose of its scan, shape (3,).
 
-    :param before: poses of the areas in the saved map.
-    :param true: ``map_T_base``, shape (3,).
+    Later scans may wait for odometry. It is None if its area was merged with another since.
     """
     slam, last = run.lock_step.processes["slam"], run.recorder.last_estimate
     assert isinstance(slam, MetricSlam)
     assert last is not None
-    decisions = run.recorder.decisions
+    decisions, before = run.recorder.decisions, log.state.recorder.global_poses
     global_poses = next(
         (decisions[n].global_poses for n in sorted(decisions, reverse=True) if decisions[n].global_poses), before
     )
     area = complete_area_poses(slam.replica.maps[slam.replica.best_hypothesis], global_poses).get(last.area)
     if area is None:
         return None
-    return se2.between(true, se2.compose(area.mean, last.pose.mean))
+    return se2.between(log.truth[log.numbers[last.stamp]], se2.compose(area.mean, last.pose.mean))
 
 
 def _is_right(error: Float64) -> bool:

@@ -150,7 +150,6 @@ def displace(drive: MappedDrive, splice: Splice) -> Displacement:
     whole = drive.whole
     stamps = {whole.records[scan].measurement.stamp: pose for scan, pose in zip(whole.scans, whole.truth, strict=True)}
     monitored = MonitoredRun(whole.configuration, drive.states[splice.left], stamps)
-    monitored.kidnap_event = monitored.events
     reports, traveled = list[LocalizationReport](), 0.0
     travel = path_lengths(whole.truth[splice.joined :])
     true = iter(whole.truth[splice.joined :])
@@ -158,6 +157,7 @@ def displace(drive: MappedDrive, splice: Splice) -> Displacement:
         monitored.run.process_record(record)
         if not isinstance(record.measurement, Scan):
             continue
+        monitored.kidnap_stamp = monitored.kidnap_stamp or record.measurement.stamp
         traveled = next(travel)
         report = monitored.report(record.measurement.stamp, next(true), traveled)
         reports += [] if report is None else [report]

@@ -91,6 +91,7 @@ class MonitoredRun:
 
     :ivar run: the five processes.
     :ivar true: {keyframe event: ``world_T_base`` (3,)}.
+    :ivar kidnap_stamp: of the first scan after the kidnapping, ns; None before.
     :ivar kidnap_event: the first keyframe event after the kidnapping, -1 before.
     """
 
@@ -105,6 +106,7 @@ class MonitoredRun:
         :param truth: {stamp of a scan up to then: ``world_T_base`` (3,)}.
         """
         self.run = LockStepRun(configuration, state=state)
+        self.kidnap_stamp: int | None = None
         self.kidnap_event = -1
         self._truth = dict(truth or {})
         scans = slam_of(self.run).replica.scans
@@ -155,7 +157,8 @@ class MonitoredRun:
     def report(self, stamp: int, true: NDArray[np.float64], traveled: float) -> LocalizationReport | None:
         """The report at a keyframe event after the kidnapping; None for other scans.
 
-        Scans may have waited for odometry, so there may be several events since the last scan.
+        Scans may have waited for odometry, so there may be several events since the last scan, and those of scans from
+        before the kidnapping come after it.
 
         :param stamp: of the scan, ns.
         :param true: ``world_T_base``, shape (3,), at the scan.
@@ -164,7 +167,10 @@ class MonitoredRun:
         new = range(self._reported, self.events)
         self._reported = self.events
         for event in new:
-            self.true[event] = self._truth[self.run.recorder.keyframes[event].scan.stamp]
+            taken = self.run.recorder.keyframes[event].scan.stamp
+            self.true[event] = self._truth[taken]
+            if self.kidnap_event < 0 and self.kidnap_stamp is not None and taken >= self.kidnap_stamp:
+                self.kidnap_event = event
         if not new or self.kidnap_event < 0:
             return None
         event, probability = self.events - 1, localization_probability(self.run)

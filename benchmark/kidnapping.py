@@ -116,18 +116,17 @@ def drive_kidnapped(name: str, changes: Sequence[str] = (), gap: float = 0.0) ->
     reports: list[LocalizationReport] = []
     stamps, truth, parts = list[int](), list[NDArray[np.float64]](), list[bool]()
     for record in leave_gap(open_log(name).records(), gap):
-        before = monitored.events
         monitored.run.process_record(record)
         if not isinstance(record.measurement, Scan) or record.true_pose is None:
             continue
         last = truth[-1] if truth else record.true_pose
         if _is_jump(last, record.true_pose):
-            monitored.kidnap_event = before
-        elif monitored.kidnap_event >= 0:
+            monitored.kidnap_stamp = record.measurement.stamp
+        elif monitored.kidnap_stamp is not None:
             traveled += math.hypot(*(record.true_pose - last)[:2])
         stamps.append(record.measurement.stamp)
         truth.append(record.true_pose)
-        parts.append(monitored.kidnap_event >= 0)
+        parts.append(monitored.kidnap_stamp is not None)
         report = monitored.report(record.measurement.stamp, record.true_pose, traveled)
         reports += [] if report is None else [report]
     result = monitored.run.finish()

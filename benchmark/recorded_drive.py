@@ -42,11 +42,6 @@ class MappedDrive:
     keyframes: Sequence[int]
     closures: Sequence[DefiniteClosure]
 
-    @property
-    def numbers(self) -> dict[int, int]:
-        """{stamp of a scan: its number}."""
-        return {self.whole.records[scan].measurement.stamp: n for n, scan in enumerate(self.whole.scans)}
-
 
 def map_drive(path: Path | str, configuration: Configuration) -> MappedDrive:
     """Map a log, and its second half by itself."""
@@ -69,8 +64,7 @@ def map_drive(path: Path | str, configuration: Configuration) -> MappedDrive:
     second = process_records(LockStepRun(configuration), records[scans[middle - 1] + 1 :]).state
     halves = states[middle - 1], second
     mapped = MappedLog(configuration, records, whole, scans, truth, range(len(scans)))
-    numbers = {records[scan].measurement.stamp: n for n, scan in enumerate(scans)}
-    keyframes = [numbers[stamp] for stamp in watch.stamps]
+    keyframes = [mapped.numbers[stamp] for stamp in watch.stamps]
     return MappedDrive(mapped, halves, {int(n): states[int(n)] for n in points}, keyframes, watch.accepted)
 
 

@@ -130,7 +130,7 @@ def closures_of_seed(drive: JudgedLog, seed: int) -> list[dict[str, Any]]:
         watch.accepted = list(drive.mapped.closures)
     else:
         follow(LockStepRun(replace(whole.configuration, seed=seed)), whole.records, watch)
-    judged = (judge_closure(c, drive.mapped.numbers, drive.chains, whole.truth) for c in watch.accepted)
+    judged = (judge_closure(c, whole.numbers, drive.chains, whole.truth) for c in watch.accepted)
     return [{"seed": seed} | one for one in judged]
 
 

@@ -81,6 +81,20 @@ def test_the_pose_counts_in_the_area_that_the_robot_is_in_after_the_event():
     assert monitored.estimate_error(true).is_right
 
 
+def test_events_of_scans_from_before_the_kidnapping_are_not_reported():
+    monitored, reports = MonitoredRun(Configuration()), []
+    for n, record in enumerate(itertools.islice(open_log("sim:ring,seed=1").records(), 200)):
+        monitored.run.process_record(record)
+        if isinstance(record.measurement, Scan):
+            if n > 100 and monitored.kidnap_stamp is None:
+                monitored.kidnap_stamp = record.measurement.stamp + 1
+            reports.append(monitored.report(record.measurement.stamp, record.true_pose, 0.0))
+    first = next(report for report in reports if report is not None)
+    assert first.event == monitored.kidnap_event
+    scans = {event: keyframe.scan.stamp for event, keyframe in monitored.run.recorder.keyframes.items()}
+    assert scans[first.event - 1] < monitored.kidnap_stamp <= scans[first.event]
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_robot_is_kidnapped_once_without_odometry(kind):
     log = open_log(draw_drive("ring", kind, 1))

@@ -226,7 +226,7 @@ class TestMappedWorld:
         error = se2.between(se2.between(own[0], own), se2.between(true[0], true))
         assert np.hypot(*error[:, :2].T).max() < 0.3
         assert office.closures
-        assert all(judge_closure(one, office.numbers, None, own)["right"] for one in office.closures)
+        assert all(judge_closure(one, office.whole.numbers, None, own)["right"] for one in office.closures)
 
     @pytest.mark.parametrize(("number", "kind"), [(0, "before"), (1, "again")])
     def test_a_displacement_is_noticed_and_the_robot_found(self, office, number, kind):
