@@ -76,42 +76,42 @@ def test_events_are_counted_by_their_condition():
 @pytest.mark.parametrize("condition", FAULTS)
 def test_after_a_fault_the_same_scans_make_a_kidnapping_more_probable(condition):
     scans = (-3.0, 6.0, 4.0)
-    ordinary, event = after_events(scans).kidnapping_test(PRIORS)
-    faulty, onset = after_events(scans, {1: condition}).kidnapping_test(PRIORS)
-    assert (event, onset) == (6, 6)
+    ordinary, event, _ = after_events(scans).kidnapping_test(PRIORS)
+    faulty, onset, condition_then = after_events(scans, {1: condition}).kidnapping_test(PRIORS)
+    assert (event, onset, condition_then) == (6, 6, condition)
     # Evidence of ordinary motions has a drift of 1 nat at each event.
     assert 3.5 + 2.0 * CUSUM_DRIFT + math.log(1.0 - PRIORS.aliasing) < faulty - ordinary
     assert faulty - ordinary < math.log(1.0 / PRIORS.fault) + 2.0 * CUSUM_DRIFT
 
 
-def test_the_fault_is_the_onset_where_the_first_scan_after_it_shows_little():
+def test_scans_that_agree_after_the_fault_are_none_of_those_since_the_onset():
+    """The robot may have been put into a similar place, which ended there."""
     state = after_events((0.5, 4.0, 4.0), {0: "after_gap"})
-    _, onset = state.kidnapping_test(PRIORS)
-    assert onset == 5
-    assert state.onset_condition(onset) == "after_gap"
+    test = state.kidnapping_test(PRIORS)
+    assert (test.since, test.condition) == (6, "after_gap")
     assert state.after_area_change({}).kidnapping_test(PRIORS) == state.kidnapping_test(PRIORS)
 
 
 def test_a_fault_alone_is_no_evidence():
     state = after_events((0.5,), {0: "after_gap"})
     assert state.onset_conditions == {5: "after_gap"}
-    assert state.kidnapping_test(PRIORS) == (-math.inf, 0)
+    assert state.kidnapping_test(PRIORS) is None
 
 
 def test_a_fault_before_scans_that_fit_is_remembered_since_another_place_may_be_similar():
     state = after_events((0.5, *(-4.0,) * 5), {0: "after_gap"})
     assert state.onset_conditions == {5: "after_gap"}
-    assert state.kidnapping_test(PRIORS) == (-math.inf, 0)
-    odds, onset = after_events((6.0, 6.0), state=state, first=11).kidnapping_test(PRIORS)
+    assert state.kidnapping_test(PRIORS) is None
+    odds, onset, condition = after_events((6.0, 6.0), state=state, first=11).kidnapping_test(PRIORS)
     alone = HypothesisState(surroundings=state.surroundings, kidnapping_counts=state.kidnapping_counts)
-    others, _ = after_events((6.0, 6.0), state=alone, first=11).kidnapping_test(PRIORS)
-    assert onset == 5
+    others, _, _ = after_events((6.0, 6.0), state=alone, first=11).kidnapping_test(PRIORS)
+    assert (onset, condition) == (11, "after_gap")
     assert odds > others + 1.0
 
 
 def test_the_longer_scans_fit_the_less_a_fault_counts():
     states = [after_events((*(-4.0,) * n, 6.0, 6.0), {0: "after_gap"}) for n in (2, 6, 10)]
-    odds = [state.kidnapping_test(PRIORS)[0] for state in states]
+    odds = [state.kidnapping_test(PRIORS).log_odds for state in states]
     assert odds[0] > odds[1] > odds[2]
     assert not after_events((-4.0,) * 28, {0: "after_gap"}).onset_conditions
 
@@ -128,8 +128,7 @@ def test_a_fault_is_remembered_as_long_as_evidence():
 
 
 def test_a_fault_while_evidence_adds_up_does_not_replace_a_better_onset():
-    _, onset = after_events((12.0, 1.1, 1.1), {2: "after_gap"}).kidnapping_test(PRIORS)
-    assert onset == 5
+    assert after_events((12.0, 1.1, 1.1), {2: "after_gap"}).kidnapping_test(PRIORS)[1:] == (5, "ordinary")
 
 
 def test_the_evidence_since_a_fault_is_that_of_all_places_where_the_robot_may_be():

@@ -153,6 +153,19 @@ class Lost:
     kind: Literal["lost"] = "lost"
 
 
+class KidnappingTest(NamedTuple):
+    """The result of a test for a kidnapping.
+
+    :ivar log_odds: of a kidnapping.
+    :ivar since: the first keyframe event since which scans contradict.
+    :ivar condition: of the motion in which it would have been.
+    """
+
+    log_odds: float
+    since: int
+    condition: MotionCondition
+
+
 @dataclass(frozen=True, eq=False)
 class HypothesisState:
     """What TSBI remembers of a hypothesis beside its map; children inherit it.
@@ -258,24 +271,32 @@ class HypothesisState:
     def _prior_log_odds(self, event: int, priors: KidnappingPriors) -> float:
         return priors.log_odds(self.onset_condition(event), self.kidnapping_counts)
 
-    def kidnapping_test(self, priors: KidnappingPriors) -> tuple[float, int]:
-        """Log-odds of a recent kidnapping, and the first keyframe event after it (CUSUM test, Page 1954).
+    def kidnapping_test(self, priors: KidnappingPriors) -> KidnappingTest | None:
+        """The test for a recent kidnapping (CUSUM, Page 1954); None where the scans do not contradict on the whole.
 
-        Of the events that may be the first, and since which the scans contradict on the whole, it is the most probable:
-        the first one with enough evidence, or one after a motion that was not ordinary.
+        The kidnapping was before the first event since which scans contradict, or before an earlier one after a motion
+        that was not ordinary, whichever is more probable: between the two the robot may be in a similar place
+        (docs/decisions/0068-after-a-gap.md).
         """
         evidence = self.kidnapping_evidence
-        onset = _ONSET_SHARE * max(evidence.values(), default=0.0)
-        candidates = {event for event in evidence if event in self.onset_conditions}
-        candidates |= {min(event for event, nats in evidence.items() if nats >= onset)} if onset > 0.0 else set()
-        best = -math.inf, 0
-        for first in sorted(candidates):
-            statistic = self._statistic(evidence, first, priors)
-            log_odds = self._prior_log_odds(first, priors) + statistic
-            least = CUSUM_DRIFT if first in self.onset_conditions else 0.0
-            if statistic > least and log_odds > best[0]:
-                best = log_odds, first
-        return best
+        least = _ONSET_SHARE * max(evidence.values(), default=0.0)
+        onset = min((event for event, nats in evidence.items() if nats >= least > 0.0), default=None)
+        if onset is None:
+            return None
+        tests = [
+            KidnappingTest(self._prior_log_odds(first, priors) + statistic, onset, self.onset_condition(first))
+            for first in sorted({onset, *self._faults_until(onset)})
+            if (statistic := self._statistic(evidence, first, priors)) > self._least_statistic(first)
+        ]
+        return max(tests, key=lambda test: test.log_odds, default=None)
+
+    def _least_statistic(self, first: int) -> float:
+        """The evidence that scans since an event have to exceed, nats: after a fault more than clutter has."""
+        return CUSUM_DRIFT if first in self.onset_conditions else 0.0
+
+    def _faults_until(self, event: int) -> list[int]:
+        """The events of the evidence after motions that were not ordinary, up to an event."""
+        return [first for first in self.onset_conditions if first in self.kidnapping_evidence and first <= event]
 
     def onset_condition(self, event: int) -> MotionCondition:
         """The condition of the motion to a keyframe event of the evidence."""

@@ -32,16 +32,18 @@ _MIN_KIDNAPPED_KEYFRAMES = 3
 
 def spawn_kidnapped_hypothesis(branching: Branching, parent: Parent) -> Branches | None:
     """The children "not kidnapped" and "kidnapped", or None where a kidnapping is too improbable."""
-    log_odds, since = parent.state.kidnapping_test(branching.kidnapping_priors)
-    keyframes = _keyframes_since(parent, since)
+    test = parent.state.kidnapping_test(branching.kidnapping_priors)
+    if test is None:
+        return None
+    keyframes = _keyframes_since(parent, test.since)
     if (
-        log_odds < math.log(branching.options.kidnapping_odds)
+        test.log_odds < math.log(branching.options.kidnapping_odds)
         or parent.probability < _MIN_KIDNAPPED_PROBABILITY
         or len(keyframes) < _MIN_KIDNAPPED_KEYFRAMES
     ):
         return None
-    kidnapped = _kidnapped_child(branching, parent, keyframes, log_odds)
-    counted = kidnapped.state.after_kidnapping(parent.state.onset_condition(since))
+    kidnapped = _kidnapped_child(branching, parent, keyframes, test.log_odds)
+    counted = kidnapped.state.after_kidnapping(test.condition)
     stays = parent.unchanged_child(parent.state.without_kidnapping_evidence())
     return Branches([stays, replace(kidnapped, state=counted)], True)
 
@@ -54,12 +56,11 @@ def decide_without_mapping(branching: Branching, parent: Parent, event: int) -> 
 
     :param event: the newest; metric SLAM resets its filters at the next one.
     """
-    log_odds, since = parent.state.kidnapping_test(branching.kidnapping_priors)
-    state = parent.state
-    if log_odds > 0.0:
-        if not _confirms_tracked_pose(branching, parent, since):
-            probability = 1.0 / (1.0 + math.exp(log_odds))
-            alarm = FalseAlarm(state.unstored_poses[event], probability, state.onset_condition(since))
+    test, state = parent.state.kidnapping_test(branching.kidnapping_priors), parent.state
+    if test is not None and test.log_odds > 0.0:
+        if not _confirms_tracked_pose(branching, parent, test.since):
+            probability = 1.0 / (1.0 + math.exp(test.log_odds))
+            alarm = FalseAlarm(state.unstored_poses[event], probability, test.condition)
             state = replace(state, localization=Lost(event + 1, false_alarm=alarm))
         state = replace(state.without_kidnapping_evidence(), unstored_poses={})
     return parent.unchanged_child(state)
