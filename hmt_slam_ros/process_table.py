@@ -136,7 +136,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
         factory="hmt_slam_ros.loop_closure.tlca:Tlca",
         state="hmt_slam_ros.loop_closure.tlca:TlcaState",
         libraries=("scipy.sparse.csgraph", "scipy.sparse.linalg"),
-        produces=("ClosureDecision",),
+        produces=("ClosureDecision", "Ambiguity"),
         niceness=_TOPOLOGY_NICENESS,
     ),
     ProcessRow(
@@ -160,7 +160,7 @@ COMPANIONS: tuple[NodeRow, ...] = (
         "explorer",
         "exploration",
         f"{_ROS}.task_nodes:ExplorerNode",
-        ("Task", "Scan", "RealTimePose", "Keyframe", "Hypotheses", "ClosureDecision"),
+        ("Task", "Scan", "RealTimePose", "Keyframe", "Hypotheses", "ClosureDecision", "Ambiguity"),
     ),
     NodeRow(
         "pilot",
@@ -194,6 +194,7 @@ DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow(f"{_DOCUMENTS}:ResetResponse", "hmt/reset_response", "reset_response", 1),
     DocumentRow("hmt_slam_ros.messages.tasks:PlaceEstimate", "pilot/place_estimate", "place_estimate", 2),
     DocumentRow(f"{_MESSAGES}:EarlyEstimate", "hmt/early_estimate", "early_estimate", 1),
+    DocumentRow("hmt_slam_ros.messages.ambiguity:Ambiguity", "hmt/ambiguity", "ambiguity", 1),
 )
 """Messages that travel as JSON documents."""
 

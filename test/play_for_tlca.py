@@ -9,6 +9,7 @@ from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.loop_closure.tlca import Tlca
+from hmt_slam_ros.messages.ambiguity import Ambiguity
 from hmt_slam_ros.messages.map_changes import Arc, MovedKeyframe
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, HypothesisEstimate, Keyframe, Notice
 from hmt_slam_ros.registration.consistency import Clutter
@@ -28,9 +29,10 @@ class Play:
     def __init__(self, refinement=0, **changes):
         options = {"accept_keyframes": 3, "accept_distance": 1.0, "accept_probability": 0.9} | changes
         named = {f"tlca.{name}": value for name, value in options.items()}
-        self.process = Tlca(with_changes(Configuration(), named | {"refinement.iterations": refinement}))
+        self.configuration = with_changes(Configuration(), named | {"refinement.iterations": refinement})
+        self.process = Tlca(self.configuration)
         self.k = -1
-        self.notices = []
+        self.notices, self.ambiguities = [], []
 
     def step(self, *hypotheses, places=None, world=HOME, travelled=None):
         """One keyframe event: ``places`` are (hypothesis, area, area_T_base) before it, ``hypotheses`` TSBI's answer.
@@ -50,6 +52,7 @@ class Play:
         answers = self.process.handle(Hypotheses(self.k, tuple(hypotheses) or (Hypothesis(0, 0, 1.0, 0),)))
         verdicts = [message for message in answers if isinstance(message, ClosureDecision)]
         self.notices += [message for message in answers if isinstance(message, Notice)]
+        self.ambiguities += [message for message in answers if isinstance(message, Ambiguity)]
         assert len(verdicts) == 1
         assert verdicts[0].sequence == self.k
         return verdicts[0]

@@ -5,6 +5,8 @@ import pytest
 import worlds
 from play_for_tlca import HOME, SPREAD, WORLD, Play, new_area, poses_of
 
+from hmt_slam_ros.loop_closure.tlca import Tlca
+from hmt_slam_ros.messages.documents import encode
 from hmt_slam_ros.messages.messages import AreaEvents, Hypothesis
 
 
@@ -120,3 +122,34 @@ def test_a_single_hypothesis_is_accepted_whatever_was_not_examined(unexamined):
     play = Play()
     play.start()
     assert play.step(new_area(0, 0, 1.0 - unexamined, 1, [4.0, 0.0, 0.0])).hypothesis == 0
+
+
+def test_the_ambiguity_comes_where_hypotheses_change_and_every_two_meters():
+    play = Play(accept_distance=10.0)
+    branch(play, 0.6)  # at 0.5 m
+    assert [found.sequence for found in play.ambiguities] == [1]
+    assert play.ambiguities[0].entropy == pytest.approx(0.673, abs=0.001)
+    assert "0.60 in area 1, 0.40 in area 1" in play.ambiguities[0].text
+    for travelled in (1.0, 1.9, 2.1, 3.9):
+        play.step(*both(0.6), travelled=travelled)
+    assert [found.sequence for found in play.ambiguities] == [1, 4]
+    play.step(*both(0.4), travelled=3.95)  # the other one is the most probable now
+    assert [found.sequence for found in play.ambiguities] == [1, 4, 6]
+
+
+def test_an_empty_ambiguity_comes_once_where_one_hypothesis_is_left():
+    play = Play(accept_distance=0.0)
+    branch(play)
+    for _ in range(4):
+        play.step(*both()) if len(play.process._replica.maps) > 1 else play.step(Hypothesis(1, 1, 1.0, 1))
+    assert [(found.sequence, found.is_open) for found in play.ambiguities] == [(1, True), (3, False)]
+    assert play.ambiguities[-1].looks == ()
+
+
+def test_it_goes_on_with_the_same_ambiguities_from_its_state():
+    play, again = Play(accept_distance=10.0), Play(accept_distance=10.0)
+    branch(play, 0.6)
+    again.process, again.k = Tlca(play.configuration, play.process.state), play.k
+    for one in (play, again):
+        one.step(*both(0.6), travelled=2.5)
+    assert encode(play.ambiguities[-1]) == encode(again.ambiguities[-1])

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.messages.ambiguity import Ambiguity
 from hmt_slam_ros.messages.documents import (
     FinalCounts,
     KeyframeHeader,
@@ -57,6 +58,7 @@ KINDS = (
     ResetRequest,
     ResetResponse,
     PlaceEstimate,
+    Ambiguity,
 )
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 

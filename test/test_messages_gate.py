@@ -5,6 +5,7 @@ import pytest
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.messages.ambiguity import Ambiguity, Look
 from hmt_slam_ros.messages.documents import SaveRequest, SaveResponse, encode
 from hmt_slam_ros.messages.gate import ChainGate, check_message, check_save_folder, decode_checked
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, LocalEstimate
@@ -27,6 +28,9 @@ def estimate(covariance, x=0.0):
         estimate([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
         estimate(1e300 * np.eye(3)),
         estimate(np.eye(3), x=1e308),
+        Ambiguity(0, 0.5, (Look(0, np.zeros(3), 0.1, 1.0, 0),), ""),
+        Ambiguity(0, 0.5, (Look(0, np.zeros(3), 0.1, 1.0, -2),), ""),
+        Ambiguity(0, 0.5, (Look(0, np.zeros(3), 0.1, -3.0, -1),), ""),
         SaveRequest(2**62, 0, "", False),
         SaveRequest(1, -1, "", False),
         SaveResponse(1, "stranger", ()),

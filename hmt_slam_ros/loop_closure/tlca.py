@@ -26,11 +26,15 @@ from hmt_slam_ros.loop_closure.closure_history import (
     merge_arc_keyframes,
 )
 from hmt_slam_ros.loop_closure.closure_revision import ClosureRevision, ClosureRevisionState, RevisionRequest
+from hmt_slam_ros.loop_closure.disambiguation import Disambiguation, probable_hypotheses
 from hmt_slam_ros.messages.map_changes import Arc, AreaPose, MovedKeyframe
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, Keyframe, Message, Notice
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
 
 FrameKey = tuple[int, int, int]
+
+_LOOKS_DISTANCE = 2.0
+"""Path between two computations of looks while the probable hypotheses stay the same, m."""
 
 _MIN_FALSE_PROBABILITY = 1e-6
 """Smallest probability that an accepted closure is false, whatever ``tlca.accept_probability`` is."""
@@ -139,7 +143,7 @@ class TlcaState:
 
 
 class Tlca:
-    """Answers every ``Hypotheses`` with a ``ClosureDecision``.
+    """Answers every ``Hypotheses`` with a ``ClosureDecision``, and with an ``Ambiguity`` while several are probable.
 
     A path is accepted when it has dominated for some keyframes and meters since it branched off, and at once when no
     other is left. Then the others are dropped, the areas that it joined are aligned, and arcs are fused with earlier
@@ -155,12 +159,13 @@ class Tlca:
         self._gate = chi_square_gate(configuration.tsbi.gate_probability)
         self._closure_revision = ClosureRevision(self._options, state.closure_revision)
         self._ambiguity = PoseAmbiguity(state.area_frames)
+        self._disambiguation = Disambiguation(configuration)
         # Without the three parts above, which change in place.
         self._state = replace(state, replica=ReplicaState(), closure_revision=ClosureRevisionState(), area_frames={})
         # TSBI's probabilities are not trusted beyond the configured risk.
         self._min_false_probability = max(1.0 - self._options.accept_probability, _MIN_FALSE_PROBABILITY)
         self._new_closures: frozenset[ClosureId] = frozenset()
-        self._is_mapping = True
+        self._is_mapping, self._looks_are_due = True, False
 
     @property
     def state(self) -> TlcaState:
@@ -177,6 +182,7 @@ class Tlca:
         if isinstance(message, Keyframe):
             self._replica.add_keyframe(message)
             self._is_mapping = message.mapping
+            self._looks_are_due = self._state.path_length // _LOOKS_DISTANCE != message.path_length // _LOOKS_DISTANCE
             poses = {estimate.hypothesis: estimate.pose.mean for estimate in message.estimates}
             poses = {**self._state.poses, **poses}
             self._state = replace(self._state, path_length=message.path_length, poses=poses)
@@ -185,6 +191,7 @@ class Tlca:
         return []
 
     def _decide(self, hypotheses: Hypotheses) -> list[Message]:
+        before = _probable(self._replica)
         paths = {h.id: self._updated_path(h, hypotheses.sequence) for h in hypotheses.hypotheses}
         poses = {h.id: _rebase_pose(self._state.poses[h.parent], h) for h in hypotheses.hypotheses}
         self._replica.apply_hypotheses(hypotheses)
@@ -197,12 +204,26 @@ class Tlca:
         self._state = replace(self._state, paths=paths)
         versions = {hypothesis: path.version for hypothesis, path in paths.items()}
         decision = replace(decision, ambiguity=self._ambiguity.second_moment(self._replica, poses, versions))
+        ambiguities = self._changed_ambiguity(hypotheses.sequence, before, poses)
         request = None if definite is None else self._revision_request(definite, hypotheses.sequence)
         if request is not None:
             # Without global poses: an inconsistent map is not published.
-            return [request.notice, replace(decision, revised_hypotheses=request.hypotheses)]
+            return [request.notice, replace(decision, revised_hypotheses=request.hypotheses), *ambiguities]
         global_poses, notices = self._global_poses()
-        return [*notices, replace(decision, global_poses=global_poses)]
+        return [*notices, replace(decision, global_poses=global_poses), *ambiguities]
+
+    def _changed_ambiguity(
+        self, sequence: int, before: frozenset[tuple[int, bool]], poses: Mapping[int, Float64]
+    ) -> list[Message]:
+        """The ambiguity where it may have changed; an empty one where several hypotheses were probable before.
+
+        :param before: :func:`_probable` before the event.
+        :param poses: {hypothesis: ``area_T_base`` in the hypothesis's area}.
+        """
+        now = _probable(self._replica)
+        if max(len(now), len(before)) < 2 or (now == before and not self._looks_are_due):
+            return []
+        return [self._disambiguation.ambiguity(sequence, self._replica, poses)]
 
     def _revision_request(self, hypothesis: int, event: int) -> RevisionRequest | None:
         """The request to revise closures that have just been accepted, if they are inconsistent."""
@@ -322,6 +343,11 @@ class Tlca:
             )
             for a, b in misfits
         ]
+
+
+def _probable(replica: Replica) -> frozenset[tuple[int, bool]]:
+    """The probable hypotheses, and whether each is the most probable."""
+    return frozenset((h, number == 0) for number, h in enumerate(probable_hypotheses(replica.probabilities)))
 
 
 def _rebase_pose(pose: Float64, hypothesis: Hypothesis) -> Float64:

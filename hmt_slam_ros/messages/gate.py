@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.messages.ambiguity import NOT_DRIVEN, Ambiguity
 from hmt_slam_ros.messages.documents import (
     KeyframeHeader,
     ResetRequest,
@@ -110,6 +111,8 @@ def _check_kind(message: object) -> None:
     """Check what is particular to a kind of messages."""
     if isinstance(message, Hypotheses):
         _check_hypotheses(message)
+    elif isinstance(message, Ambiguity):
+        _check_looks(message)
     elif isinstance(message, Keyframe):
         check_scan(message.scan)
     elif isinstance(message, KeyframeHeader):
@@ -218,6 +221,12 @@ def _check_hypotheses(message: Hypotheses) -> None:
     for probability in (*probabilities, message.unexamined, sum(probabilities)):
         is_one = -_TOLERANCE <= probability <= 1.0 + _TOLERANCE
         _require(is_one, "probability", probability, "between 0 and 1, as their sum")
+
+
+def _check_looks(message: Ambiguity) -> None:
+    for number, look in enumerate(message.looks):
+        _require(NOT_DRIVEN <= look.previous < number, "previous", look.previous, "the number of an earlier look")
+        _require(look.path_length >= 0.0, "path_length", look.path_length, "0 or more")
 
 
 def _check_request_number(name: str, number: int) -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.messages.ambiguity import Ambiguity
 from hmt_slam_ros.messages.map_changes import (
     Arc,
     ArcEnds,
@@ -375,6 +376,7 @@ Message = (
     | AreaEvents
     | Hypotheses
     | ClosureDecision
+    | Ambiguity
     | LocalEstimate
     | EarlyEstimate
     | ScanPoses

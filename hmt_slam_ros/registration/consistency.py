@@ -68,6 +68,20 @@ class ConsistencyTest(NamedTuple):
         :param usual: rate of contradictions in the same place.
         """
         on, free = found.on_surface / self.correlated_samples, found.in_free_space / self.correlated_samples
+        return self._log_ratio(on, free, usual)
+
+    def log_ratio_in_similar_place(self, samples: int, usual: float) -> float:
+        """The log-likelihood ratio, nats, with as many contradictions as a similar place has on average.
+
+        :param samples: number of samples, all on surfaces or contradicting.
+        :param usual: rate of contradictions in the same place.
+        """
+        stretches, odds = samples / self.correlated_samples, usual + self.extra_rate
+        free = stretches * odds / (1.0 + odds)
+        return self._log_ratio(stretches - free, free, usual)
+
+    def _log_ratio(self, on: float, free: float, usual: float) -> float:
+        """:meth:`log_likelihood_ratio` of numbers of stretches."""
         same, similar = usual * self.concentration, (usual + self.extra_rate) * self.concentration
         return self._log_probability(same, on, free) - self._log_probability(similar, on, free)
 

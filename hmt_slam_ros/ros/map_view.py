@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import ELLIPSE_95, PoseGaussian
@@ -89,6 +90,14 @@ class MapRenderer:
             if message.global_poses:
                 self._area_poses = {entry.area: entry.pose for entry in message.global_poses}
             self.version += 1
+
+    def pose_in_map(self, area: int, pose: Float64) -> Float64 | None:
+        """``map_T_base`` (3,) of a pose in an area, None where the area has no pose in the map.
+
+        :param pose: ``area_T_base``, shape (3,).
+        """
+        belief = self._area_poses.get(area)
+        return None if belief is None else se2.compose(belief.mean, pose)
 
     def _area_ids(self) -> list[int]:
         hybrid_map = self._replica.maps[self._replica.best_hypothesis]

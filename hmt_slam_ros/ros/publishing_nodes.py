@@ -5,29 +5,49 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap
 from rclpy.publisher import Publisher
 from std_msgs.msg import Bool, Float64, Float64MultiArray
 from visualization_msgs.msg import MarkerArray
 
+from hmt_slam_ros.messages.ambiguity import Ambiguity
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Message, RealTimePose, TrackingReset
 from hmt_slam_ros.real_time_localization.rtl import CorrectionSmoother
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import area_frame, pose_with_covariance_message, table_message, transform_message
+from hmt_slam_ros.ros.conversions import (
+    area_frame,
+    header_message,
+    pose_message,
+    pose_with_covariance_message,
+    table_message,
+    transform_message,
+)
 from hmt_slam_ros.ros.execution import set_realtime_priority
 from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
 from hmt_slam_ros.ros.parameters import declare_frame
 from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.recovery import CHECKPOINT
-from hmt_slam_ros.ros.topics import ENTROPY, GRAPH, HMT_POSE, IS_LOCALIZED, MAP, PMF, POSE, transform_publisher
+from hmt_slam_ros.ros.topics import (
+    AMBIGUITY_GOAL,
+    ENTROPY,
+    GRAPH,
+    HMT_POSE,
+    IS_LOCALIZED,
+    MAP,
+    PMF,
+    POSE,
+    transform_publisher,
+)
 from hmt_slam_ros.saved_map.folder import VERSION, FolderReader
 
 if TYPE_CHECKING:
     from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 _RENDERER_STATE = "view"
+_AMBIGUITY = "ambiguity"
+"""Name of the value in /diagnostics."""
 _RENDER_PERIOD = 3.0
 """Time between two checks whether the map has to be published again, s."""
 
@@ -74,7 +94,7 @@ def pmf_message(hypotheses: Hypotheses) -> Float64MultiArray:
 
 
 class TlcaNode(ProcessNode):
-    """The node ``tlca``: the occupancy grid, and the graph of areas and arcs."""
+    """The node ``tlca``: the occupancy grid, the graph of areas and arcs, and where a look would decide."""
 
     def declare_own_parameters(self) -> None:
         """As any process node; also declare ``map_frame``."""
@@ -87,6 +107,7 @@ class TlcaNode(ProcessNode):
         self._renderer = self._make_renderer(MapRendererState.from_document(self.initial_state.map))
         self._grids = self.create_publisher(OccupancyGrid, MAP, topics.LATCHED)
         self._graphs = self.create_publisher(MarkerArray, GRAPH, topics.LATCHED)
+        self._ambiguity_goals = self.create_publisher(PoseStamped, AMBIGUITY_GOAL, topics.STREAM)
         self._published_versions = {GRAPH: 0, MAP: 0}
         self.create_timer(_RENDER_PERIOD, self._publish_if_changed, clock=self.diagnostics.steady_clock)
         self.create_service(GetMap, "~/get_map", self._get_map)
@@ -97,6 +118,7 @@ class TlcaNode(ProcessNode):
     def reset(self, folder: str, reset_number: int = 0) -> None:
         """As any process node; also publish the new map."""
         super().reset(folder, reset_number)
+        self.diagnostics.values.pop(_AMBIGUITY, None)
         self._renderer = self._make_renderer(MapRendererState.from_document(self.initial_state.map))
         self._published_versions = {GRAPH: -1, MAP: -1}
 
@@ -115,9 +137,21 @@ class TlcaNode(ProcessNode):
         return response
 
     def publish_views(self, message: Message, outputs: list[Message]) -> None:
-        """Update the map; a timer publishes it."""
+        """Update the map, which a timer publishes; publish where a look would decide."""
         for value in (message, *outputs):
             self._renderer.update(value)
+            if isinstance(value, Ambiguity):
+                self._publish_ambiguity(value)
+
+    def _publish_ambiguity(self, ambiguity: Ambiguity) -> None:
+        self.diagnostics.values[_AMBIGUITY] = ambiguity.text or "one hypothesis is probable"
+        best = ambiguity.best_look()
+        pose = (
+            None if best is None else self._renderer.pose_in_map(ambiguity.looks[best].area, ambiguity.looks[best].pose)
+        )
+        if pose is not None:
+            header = header_message(self._renderer.stamp, self._map_frame)
+            self._ambiguity_goals.publish(PoseStamped(header=header, pose=pose_message(pose)))
 
     def _publish_if_changed(self) -> None:
         if not self.is_active:

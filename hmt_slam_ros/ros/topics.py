@@ -70,6 +70,7 @@ COST = "hmt/cost"
 HMT_POSE, POSE = "hmt/pose", "pose"
 MAP, GRAPH, PARTICLES, PMF = "map", "hmt/graph", "hmt/particles", "hmt/pmf"
 IS_LOCALIZED, ENTROPY = "hmt/is_localized", "hmt/entropy"
+AMBIGUITY_GOAL = "hmt/ambiguity_goal"
 INITIAL_POSE = "initialpose"
 DIAGNOSTICS = "diagnostics"
 
