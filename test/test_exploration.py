@@ -23,6 +23,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.landmarks.openings import distance_to_doors, jamb_positions
 from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.messages.ambiguity import Ambiguity, Look
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, HypothesisEstimate, Keyframe
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.tasks import EXPLORER_TASKS, GoalPose, Task, TaskResult, VelocityCommand, parse_task
@@ -164,6 +165,58 @@ def test_it_explores_on_where_nobody_requests_it_to_turn_back() -> None:
     on = goes(own, 0.6, 0.4)
     assert own.run.driver.exploration_map.entropy == pytest.approx(0.673, abs=0.001)
     assert on is None or np.hypot(*on.pose[:2]) > 1.0
+
+
+def ambiguity_along(own: _Explored, keyframes: list[int], entropy: float = 0.6) -> Ambiguity:
+    """Looks along the keyframes, of which the last one decides; for the map as it is."""
+    atlas = own.run.driver.exploration_map
+    places = [atlas.keyframe_locator.area_and_pose(keyframe) for keyframe in keyframes]
+    looks = [Look(area, pose, 0.0, 1.0 + n, n - 1) for n, (area, pose) in enumerate(places)]
+    looks[-1] = replace(looks[-1], information=0.9 * entropy)
+    return Ambiguity(atlas.event, entropy, tuple(looks) if entropy else (), "")
+
+
+def way_to(own: _Explored, place: str) -> list[int]:
+    """The keyframes on the way from the robot to a place."""
+    atlas = own.run.driver.exploration_map
+    here = atlas.update_roadmap()
+    assert here is not None
+    return atlas.roadmap.shortest_path(here.keyframe, atlas.named_places()[place])
+
+
+def test_it_drives_to_where_a_look_decides_until_the_place_is_sure() -> None:
+    own = explore(2)
+    assert completed_task(own.run.run_task(Task("disambiguate"), 5.0)).text == "disambiguate: the place is sure"
+    assert completed_task(own.run.run_task(Task("go", "room 1"), 120.0)).succeeded
+    own.run.driver.handle(ambiguity_along(own, way_to(own, "room 2")))
+    outcome = completed_task(own.run.run_task(Task("disambiguate"), 120.0))
+    assert not outcome.succeeded
+    assert outcome.text == "disambiguate: no look within reach would decide: drive on"
+    assert np.hypot(*(own.robot.pose - true_place(own.run, "room 2"))[:2]) < 0.8
+    own.run.driver.handle(ambiguity_along(own, way_to(own, "room 2"), entropy=0.0))
+    assert completed_task(own.run.run_task(Task("disambiguate"), 5.0)).succeeded
+    assert own.robot.contacts == 0
+
+
+def test_looks_that_came_before_their_map_wait() -> None:
+    own = explore(2)
+    ahead = replace(ambiguity_along(own, way_to(own, "room 1")), sequence=own.run.driver.exploration_map.event + 2)
+    own.run.driver.handle(ahead)
+    assert completed_task(own.run.run_task(Task("disambiguate"), 0.4)).text == "disambiguate: the place is sure"
+
+
+def test_an_exploration_is_interrupted_for_looks_where_that_is_wanted() -> None:
+    for wanted in (True, False):
+        own = _Explored(explore=False, changes={"explorer.disambiguates": wanted})
+        assert own.run.run_task(Task("explore"), 25.0) is None
+        explorer = own.run.driver
+        explorer.handle(ambiguity_along(own, way_to(own, "area 0")))
+        scan = replace(scan_at((1.0, 0.0, 0.0)), stamp=explorer.exploration_map.pose.stamp)
+        explorer.handle(Task("explore"))
+        goals = [message for message in explorer.handle(scan) if isinstance(message, GoalPose)]
+        area, pose = explorer.exploration_map.keyframe_locator.area_and_pose(way_to(own, "area 0")[-1])
+        is_look = goals[0].area == area and bool(np.hypot(*(goals[0].pose - pose)[:2]) < 0.01)
+        assert is_look == wanted
 
 
 def test_scans_may_come_after_any_message_of_the_chain() -> None:
@@ -365,5 +418,7 @@ def test_tasks_as_they_are_written() -> None:
     assert parse_task("explore", EXPLORER_TASKS) == Task("explore")
     assert parse_task(" go room 3", EXPLORER_TASKS) == Task("go", "room 3")
     for text in ("go", "dance", "explore room 3", ""):
-        with pytest.raises(HmtSlamError, match=f"'{text}' is no task: give one of explore, backtrack, stop, or go"):
+        with pytest.raises(
+            HmtSlamError, match=f"'{text}' is no task: give one of explore, backtrack, disambiguate, stop, or go"
+        ):
             parse_task(text, EXPLORER_TASKS)

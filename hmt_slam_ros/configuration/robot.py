@@ -63,6 +63,9 @@ class ExplorerParameters:
     backtracks: bool = parameter(
         False, "Drive back along the own path while the entropy of the topological paths is above `places.max_entropy`."
     )
+    disambiguates: bool = parameter(
+        False, "Interrupt an exploration to drive to where a look decides between topological hypotheses."
+    )
     speed: float = parameter(0.6, "Speed at most.", 0.05, 5.0, "m/s")
     turn_rate: float = parameter(45.0, "Turn rate at most.", 1.0, 360.0, "deg/s")
     acceleration: float = parameter(0.5, "Acceleration at most, to brake as well.", 0.05, 10.0, "m/s^2")

@@ -13,11 +13,13 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.exploration.look_planner import LookPlanner
 from hmt_slam_ros.exploration.path_follower import KeyframeLocator, PathFollower, Route, motion_limits
 from hmt_slam_ros.exploration.roadmap import EntryPoint, Frontier, Roadmap
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.messages.ambiguity import Ambiguity
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message, RealTimePose
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.tasks import GoalPose, Task, TaskResult, VelocityCommand
@@ -49,6 +51,7 @@ class ExplorationMap:
 
     :ivar roadmap: of the building.
     :ivar replica: maps and scans.
+    :ivar event: the last keyframe event, -1 before the first.
     """
 
     def __init__(self, configuration: Configuration, replica: Replica | None = None) -> None:
@@ -56,6 +59,7 @@ class ExplorationMap:
         parameters = configuration.explorer
         self.roadmap = Roadmap(configuration.features, parameters.radius + parameters.margin, parameters.door)
         self.replica = replica or Replica()
+        self.event = -1
         self._pose: RealTimePose | None = None
         self._keyframe_locator: KeyframeLocator | None = None
         # Of each entered room the keyframes around the robot's pose there, the nearest first.
@@ -69,6 +73,8 @@ class ExplorationMap:
         if isinstance(message, Keyframe | Hypotheses | ClosureDecision):
             self.replica.apply_message(message)
             self._keyframe_locator = None
+            if isinstance(message, ClosureDecision):
+                self.event = message.sequence
         elif isinstance(message, RealTimePose):
             self._pose = message
 
@@ -160,7 +166,7 @@ class ExplorationMap:
 
 
 class Explorer:
-    """The explorer as a process. Consumes Task, Scan, RealTimePose and the chain; produces messages of tasks.py.
+    """The explorer as a process. Consumes Task, Scan, RealTimePose, Ambiguity and the chain; produces tasks' messages.
 
     :ivar exploration_map: the known map.
     """
@@ -183,14 +189,19 @@ class Explorer:
         self._may_retry = True
         self._max_path_entropy = configuration.places.max_entropy if parameters.backtracks else math.inf
         self._is_backtracking = False
+        self._disambiguates = parameters.disambiguates
+        self._look_planner, self._is_looking = LookPlanner(), False
 
     def handle(self, message: Message) -> list[Message]:
         """Process one message; a scan is answered with velocities."""
         if isinstance(message, Task):
             self._task = None if message.kind == "stop" else message
             self._route, self._tries, self._may_retry = None, 0, True
+            self._look_planner.forget_tries()
         elif isinstance(message, Scan):
             return self._drive(message)
+        elif isinstance(message, Ambiguity):
+            self._look_planner.add(message)
         else:
             self.exploration_map.on_message(message)
         return []
@@ -199,6 +210,7 @@ class Explorer:
         """Choose a goal if there is none, and follow the route."""
         outputs: list[Message] = []
         ready = self.exploration_map.is_localized(scan.stamp)
+        self._look_planner.update(self.exploration_map.event)
         if ready and self._task is not None:
             if self.exploration_map.has_changed and not self._keeps_route():
                 self._route = None
@@ -211,6 +223,8 @@ class Explorer:
         """Whether the route is still valid after a change of the map."""
         if self._route is None or not self.exploration_map.keyframe_locator.contains_route(self._route):
             return False
+        if self._is_looking or self._looks_first:
+            return self._is_looking and not self._look_planner.is_outdated
         if self._is_backtracking or self._is_ambiguous:
             return self._is_backtracking and self._is_ambiguous
         in_hallway = self._is_exploring and self._target is not None and self._target.is_in_hallway
@@ -225,6 +239,12 @@ class Explorer:
         """Whether the entropy of topological paths requires backtracking, as in the paper."""
         return self._is_exploring and self.exploration_map.entropy >= self._max_path_entropy
 
+    @property
+    def _looks_first(self) -> bool:
+        """Whether an exploration is interrupted for a look."""
+        may_look = self._is_exploring and self._disambiguates and self._look_planner.is_open
+        return may_look and self._look_planner.has_look(self.exploration_map.keyframe_locator)
+
     def _follow_route(self, scan: Scan, outputs: list[Message]) -> tuple[float, float]:
         """The velocities along the route; messages at its end are added to ``outputs``."""
         assert self._route is not None
@@ -238,7 +258,9 @@ class Explorer:
     def _finish_route(self, *, reached: bool) -> list[Message]:
         """End the route, and with it the task to go to a place."""
         self._route = None
-        if self._is_backtracking:
+        if self._is_looking:
+            self._look_planner.end_route()
+        if self._is_looking or self._is_backtracking:
             return []
         if self._is_exploring:
             assert self._target is not None
@@ -266,10 +288,11 @@ class Explorer:
         here = self.exploration_map.update_roadmap()
         if here is None:
             return []
-        self._is_backtracking = self._is_ambiguous
+        self._is_looking = task.kind == "disambiguate" or self._looks_first
+        self._is_backtracking = not self._is_looking and self._is_ambiguous
         planners = {"explore": self._plan_to_frontier, "go": self._plan_to_place, "backtrack": self._plan_backtracking}
-        plan = self._plan_backtracking if self._is_backtracking else planners[task.kind]
-        outputs = plan(here)
+        plan = self._plan_look if self._is_looking else planners[task.kind]
+        outputs = self._plan_backtracking(here) if self._is_backtracking else plan(here)
         if self._route is not None:
             area, goal = self.exploration_map.goal_pose(self._route)
             outputs.append(GoalPose(stamp, area, goal))
@@ -328,4 +351,15 @@ class Explorer:
         """Plan back along the robot's path."""
         path = self.exploration_map.roadmap.backtracking_path(here.keyframe)
         self._set_route(here, path, here.path[:0], _PLACE_TOLERANCE)
+        return []
+
+    def _plan_look(self, here: EntryPoint) -> list[Message]:
+        """Plan to the look with the most information per meter."""
+        if not self._look_planner.is_open:
+            return self._finish_task("the place is sure", reached=True)
+        locator, pose = self.exploration_map.keyframe_locator, self.exploration_map.pose.pose_in_area.mean
+        self._route = self._look_planner.plan(locator, here.keyframe, pose)
+        if self._route is None:
+            return self._finish_task("no look within reach would decide: drive on", reached=False)
+        self._path_follower = PathFollower(self._limits, _FRONTIER_TOLERANCE)
         return []

@@ -57,6 +57,10 @@ class KeyframeLocator:
         """Whether all keyframes of a route are in the map."""
         return all(keyframe in self._poses for keyframe in route.keyframes)
 
+    def area_pose(self, area: int) -> Float64 | None:
+        """The pose of an area in the frame of this one, (3,), None where no arc leads there."""
+        return self._areas.get(area)
+
     def area_and_pose(self, keyframe: int) -> tuple[int, Float64]:
         """The area of a keyframe, and its pose in that area, (3,)."""
         return self._poses[keyframe]

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.untrusted_input import is_short_text, shorten
 
-TaskKind = Literal["explore", "go", "backtrack", "localize", "stop"]
+TaskKind = Literal["explore", "go", "backtrack", "disambiguate", "localize", "stop"]
 
-EXPLORER_TASKS: tuple[TaskKind, ...] = ("explore", "backtrack", "stop", "go")
+EXPLORER_TASKS: tuple[TaskKind, ...] = ("explore", "backtrack", "disambiguate", "stop", "go")
 """Tasks of the explorer."""
 
 PILOT_TASKS: tuple[TaskKind, ...] = ("localize", "stop", "go")
@@ -26,7 +26,8 @@ class Task:
     """To explorer or pilot: what to do from now on.
 
     :ivar kind: "explore" until the building is known, "go" to a place, "backtrack" along the robot's own path until
-        the next task, "localize" the robot, "stop".
+        the next task, "disambiguate": to where a look decides between topological hypotheses, until one is left,
+        "localize" the robot, "stop".
     :ivar place: name of the place to go to, such as "room 3" or "area 12".
     """
 
