@@ -58,6 +58,7 @@ MEASUREMENTS = {
     "awakening": "global localization in a saved map",
     "kidnapping": "recovery of a robot that is kidnapped while it drives",
     "recorded": "closures, starts and displacements on recorded logs, right or wrong",
+    "disambiguation": "path until a robot is sure of its place, driving to where a look decides, or on",
     "laps": "memory, cost and errors over repeated laps on known ground",
     "changes": "maps of changing worlds in mode lifelong, among people",
     "scale": "time and memory in maps of up to 100,000 areas",
@@ -197,8 +198,8 @@ def _make_parser() -> argparse.ArgumentParser:
 
 def _describe_kinds() -> str:
     """The kinds of measurements and their groups, one on each line."""
-    kinds = [f"  {name:<12} {text}" for name, text in MEASUREMENTS.items()]
-    groups = [f"  {name:<12} {', '.join(kinds)}" for name, kinds in _GROUPS.items()]
+    kinds = [f"  {name:<14} {text}" for name, text in MEASUREMENTS.items()]
+    groups = [f"  {name:<14} {', '.join(kinds)}" for name, kinds in _GROUPS.items()]
     return "\n".join(["kinds:", *kinds, "", "groups of kinds:", *groups])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -11,8 +12,10 @@ from numpy.typing import NDArray
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.exploration.explorer import Explorer
 from hmt_slam_ros.exploration.pilot import PilotProcess
+from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.messages import Message
+from hmt_slam_ros.messages.routing import Process
 from hmt_slam_ros.messages.tasks import Task, TaskResult, VelocityCommand
 from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.results.hmt_map import RunState
@@ -49,21 +52,51 @@ class DrivenRun(Generic[Driver]):
     """
 
     def __init__(
-        self, robot: DrivenRobot, configuration: Configuration, driver: Driver, state: RunState | None = None
+        self,
+        robot: DrivenRobot,
+        configuration: Configuration,
+        driver: Driver,
+        state: RunState | None = None,
+        records: Iterator[LogRecord] | None = None,
     ) -> None:
-        """:param state: saved map to start from, without an initial pose; None for none."""
+        """:param state: to start from; None for none.
+
+        :param records: of the robot, which continue those of the state; None where the state is a saved map, in which
+            the robot has no initial pose.
+        """
         self.robot = robot
         self.driver: Driver = driver
         self._robot_process = _RobotProcess(robot)
         name = "explorer" if isinstance(driver, Explorer) else "pilot"
         self._run = LockStepRun(configuration, state=state, observers={name: driver, "robot": self._robot_process})
         log = DrivenLog("driven", robot)
-        self._records = log.records() if state is None else self._run.unread_records(log)
+        new_records = log.records() if state is None or records is not None else self._run.unread_records(log)
+        self._records = new_records if records is None else records
+
+    @property
+    def processes(self) -> Mapping[str, Process]:
+        """{name: process}."""
+        return self._run.lock_step.processes
+
+    @property
+    def outcome(self) -> TaskResult | None:
+        """The result of the last task, None before its end."""
+        return self._robot_process.outcome
 
     def run_task(self, task: Task, seconds: float) -> TaskResult | None:
         """Run a task; return its result, None if it takes too long.
 
         :param seconds: largest duration of the task.
+        """
+        for _ in self.drive(task, seconds):
+            if self.outcome is not None:
+                break
+        return self.outcome
+
+    def drive(self, task: Task, seconds: float) -> Iterator[None]:
+        """Run a task, and go on after its end; stops after each scan.
+
+        :param seconds: largest duration.
         """
         self._robot_process.outcome = None
         self._run.lock_step.feed(task)
@@ -72,9 +105,9 @@ class DrivenRun(Generic[Driver]):
             self._run.process_record(record)
             if isinstance(record.measurement, Scan):
                 self._run.recorder.compact()
-                if self._robot_process.outcome is not None or self.robot.stamp >= end:
-                    break
-        return self._robot_process.outcome
+                yield
+                if self.robot.stamp >= end:
+                    return
 
     def save(self, folder: Path, configuration: Configuration) -> Recording:
         """End the drive, and write its map for nodes to start from.

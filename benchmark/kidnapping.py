@@ -93,7 +93,7 @@ def leave_gap(records: Iterable[LogRecord], seconds: float) -> Iterator[LogRecor
     end = 0
     for record in records:
         if isinstance(record.measurement, Scan) and record.true_pose is not None:
-            if last is not None and _is_jump(last, record.true_pose):
+            if last is not None and is_jump(last, record.true_pose):
                 end = record.measurement.stamp + round(seconds * NANOSECONDS)
             last = record.true_pose
             if record.measurement.stamp < end:
@@ -101,7 +101,7 @@ def leave_gap(records: Iterable[LogRecord], seconds: float) -> Iterator[LogRecor
         yield record
 
 
-def _is_jump(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
+def is_jump(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
     """Whether the robot was kidnapped between two true poses, shape (3,)."""
     step = se2.between(before, after)
     return math.hypot(step[0], step[1]) > _JUMP or abs(float(step[2])) > _JUMP
@@ -120,7 +120,7 @@ def drive_kidnapped(name: str, changes: Sequence[str] = (), gap: float = 0.0) ->
         if not isinstance(record.measurement, Scan) or record.true_pose is None:
             continue
         last = truth[-1] if truth else record.true_pose
-        if _is_jump(last, record.true_pose):
+        if is_jump(last, record.true_pose):
             monitored.kidnap_stamp = record.measurement.stamp
         elif monitored.kidnap_stamp is not None:
             traveled += math.hypot(*(record.true_pose - last)[:2])

@@ -145,7 +145,7 @@ _TASK_TOPICS = ("cmd_vel", "~/task_result", "goal_pose")
 _FURTHER_PUBLISHED: dict[str, tuple[str, ...]] = {
     "slam": (*_REQUESTS, "hmt/particles"),
     "tsbi": ("hmt/pmf", "hmt/is_localized", "hmt/entropy"),
-    "tlca": ("map", "hmt/graph"),
+    "tlca": ("map", "hmt/graph", "hmt/ambiguity_goal"),
     "rtl": ("tf",),
     "robot": ("scan", "odom", "/clock", "hmt/robot_status", "tf", "tf_static", "ground_truth"),
     "explorer": _TASK_TOPICS,
@@ -167,6 +167,7 @@ _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
     "operator": (
         *("map", "pose", "hmt/pose", "hmt/graph", "hmt/particles", "diagnostics", "hmt/notices", "scan", "tf"),
         *("tf_static", "explorer/task_result", "pilot/task_result", "pilot/place_estimate"),
+        *("hmt/ambiguity", "hmt/ambiguity_goal"),
     ),
 }
 """{node: topics that follow from no message of the process table}."""

@@ -72,16 +72,19 @@ def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listene
     goals_.publish(String(data="go area 0"))
     listener.until(lambda: len(outcomes) > 2, alive=nodes)
     assert outcomes[2].data == "go area 0: the robot is there"
+    goals_.publish(String(data="disambiguate"))
+    listener.until(lambda: len(outcomes) > 3, alive=nodes)
+    assert outcomes[3].data == "disambiguate: the place is sure"
 
     *others, explorer, robot = nodes
     assert listener.call(Trigger, "slam/reset", Trigger.Request()).success
-    listener.until(lambda: len(outcomes) > 3, alive=nodes)
+    listener.until(lambda: len(outcomes) > 4, alive=nodes)
     explorer.kill()
     explorer.communicate()
     received = len(outcomes)
     again = start("explorer", laser_pose="[0.0,0.0,0.0]")
     listener.until(lambda: len(outcomes) > received, alive=[*others, robot, again])
-    assert {outcome.data for outcome in outcomes[3:]} == {explored}
+    assert {outcome.data for outcome in outcomes[4:]} == {explored}
 
 
 def test_where_a_part_of_the_map_never_comes_it_ends_with_a_sentence(listener, system, start):
