@@ -17,13 +17,6 @@ from hmt_slam_ros.sensors.relative_motion import RelativeMotion, is_wide
 from hmt_slam_ros.submap.local_filter import ParticleFilterState, PlacedKeyframe
 from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan, ScanMatch, ScanMatcher
 from hmt_slam_ros.submap.particle_filter import ParticleFilter
-from hmt_slam_ros.submap.pose_modes import (
-    allocate_particles,
-    blur_information,
-    draw_systematically,
-    mix_covariances,
-    spread_about,
-)
 
 SURE = np.diag([0.02, 0.02, 0.01]) ** 2
 OVER_GAP = np.diag([0.4, 0.05, 0.05]) ** 2
@@ -229,37 +222,3 @@ def test_odometry_leads_on_new_ground_unless_a_slip_is_clearly_more_probable(map
     modes = ScanMatcher(mapping)._select_modes(points, slip, [predicted, slip], area_filter._leading_view())
     assert len(modes) == (1 if leads == "alone" else 2)
     assert modes[0].contradicts_odometry == (leads != "odometry")
-
-
-def test_particles_are_shared_out_by_mass_and_each_mode_has_one():
-    np.testing.assert_array_equal(allocate_particles(np.array([1.0]), 12), [12])
-    np.testing.assert_array_equal(allocate_particles(np.array([0.5, 0.25, 0.25]), 12), [6, 3, 3])
-    np.testing.assert_array_equal(allocate_particles(np.array([0.97, 0.01, 0.01, 0.01]), 12), [9, 1, 1, 1])
-    np.testing.assert_array_equal(allocate_particles(np.array([0.98, 0.01, 0.01]), 3), [1, 1, 1])
-
-
-def test_systematic_draws_are_as_many_as_weights_have_it_up_to_one():
-    weights = np.random.default_rng(1).dirichlet(np.ones(7))
-    for offset in (0.0, 0.3, 0.999):
-        counts = np.bincount(draw_systematically(weights, 20, offset), minlength=7)
-        assert counts.sum() == 20
-        assert (np.abs(counts - 20 * weights) < 1.0).all()
-
-
-def test_moments_about_a_mode_are_those_of_a_mixture():
-    poses, shares = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), np.array([0.75, 0.25])
-    np.testing.assert_allclose(spread_about(poses[0], poses, shares), np.diag([1.0, 0.0, 0.0]), atol=1e-12)
-    own = [np.diag([0.1, 0.2, 0.3]), np.diag([0.5, 0.6, 0.7])]
-    expected = np.diag([0.75 * 0.1 + 0.25 * 0.5 + 1.0, 0.3, 0.4])
-    np.testing.assert_allclose(mix_covariances(poses[0], poses, own, shares), expected, atol=1e-12)
-    # A mode that faces to the left is uncertain across the other one.
-    turned = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2]])
-    mixed = mix_covariances(turned[0], turned, [np.zeros((3, 3)), np.diag([4.0, 0.0, 0.0])], shares)
-    assert mixed[1, 1] == pytest.approx(1.0)
-    assert mixed[2, 2] == pytest.approx(0.25 * (np.pi / 2) ** 2)
-
-
-def test_information_is_less_by_a_further_error_also_where_there_is_none():
-    information = np.diag([100.0, 4.0, 0.0])
-    spread = np.diag([0.0, 0.75, 5.0])
-    np.testing.assert_allclose(blur_information(information, spread), np.diag([100.0, 1.0, 0.0]), atol=1e-9)

@@ -1,10 +1,8 @@
 """The Rao-Blackwellized particle filter of one hypothesis in its current area, second step of Eq. (6).
 
 Every particle has a pose, its own map in shared patches, and its own poses of the keyframes since the robot entered the
-area. The map frame is the frame of the current area.
-
-Between two filter steps all particles of a mode move by the match of one of them, its head. There is one mode, until a
-match has several. Each then has particles by its mass, and goes by its own map, until the weights decide.
+area. The map frame is the frame of the current area. Between two filter steps, all particles of a mode of the pose move
+by one match with the map.
 """
 
 from __future__ import annotations
@@ -43,23 +41,9 @@ from hmt_slam_ros.submap.local_mapping import (
     PreparedScan,
     ScanMatch,
     ScanMatcher,
-    coincide,
     map_information,
 )
-from hmt_slam_ros.submap.pose_modes import (
-    UNMOVED,
-    PoseModes,
-    allocate_particles,
-    blur_information,
-    draw_systematically,
-    log_sum,
-    mix_covariances,
-    normalize_weights,
-    spread_about,
-)
-
-_LEAD_MARGIN = 3.0
-"""Log-likelihood ratio from which another particle leads, nats: docs/decisions/0006-pose-between-keyframes.md."""
+from hmt_slam_ros.submap.pose_modes import MotionMixture, PoseModes, log_sum, normalize_weights, share_out
 
 
 class _TrackedGroup(NamedTuple):
@@ -91,6 +75,10 @@ class _GroupProposals(NamedTuple):
     prior: Float64
     proposals: scan_to_map.Proposals
 
+    def hessian(self, particle: int) -> Float64:
+        """Information of the points at the proposal of a particle, map coordinates, shape (3, 3)."""
+        return np.asarray(self.proposals.hessians[int(np.searchsorted(self.rows, particle))])
+
 
 class ParticleFilter:
     """M particles of one hypothesis in one area; attributes as in :class:`ParticleFilterState`."""
@@ -106,8 +94,7 @@ class ParticleFilter:
         self.keyframe_areas: list[int] = []
         self.keyframe_poses = np.zeros((count, 0, 3))
         self._tables = np.stack([mapping.pool.empty_table()] * count)
-        self._predicted_poses = self.poses.copy()
-        self._last_poses = self.poses.copy()
+        self._predicted_poses, self._last_poses = self.poses.copy(), self.poses.copy()
         self._modes = PoseModes.single(count)
         self.leader = 0
         self._matcher = ScanMatcher(mapping)
@@ -188,12 +175,12 @@ class ParticleFilter:
         self.tracking_covariance = covariances[0]
         if len(groups) > 1:
             self.log_weights -= self.log_weights.max()
-            heads, shares = self._heads(), self._modes.shares(self.log_weights)
+            heads, shares = self._modes.heads(self.leader, self.log_weights), self._modes.shares(self.log_weights)
             motions = se2.between(self._last_poses[heads], self.poses[heads])
             motion = se2.between(self._last_poses[self.leader], self.pose)
-            self.tracking_covariance = mix_covariances(motion, motions, covariances, shares)
+            self.tracking_covariance = MotionMixture(motion, motions, shares).mix_covariances(covariances)
             increments = np.array([group.increment for group in groups])
-            information = blur_information(information, spread_about(lead.increment, increments, shares))
+            information = MotionMixture(lead.increment, increments, shares).blur_information(information)
         return TrackedMotion(lead.increment, information, lead.match.contradicts_odometry)
 
     def _track_mode(self, number: int, points: Float64, prediction: Prediction, most: int) -> list[_TrackedGroup]:
@@ -202,7 +189,8 @@ class ParticleFilter:
         :param points: surfels of the scan, shape (n, 4), base frame.
         :param most: modes of the match at most.
         """
-        mode, head, rows = self._modes.tracked[number], self._head(number), self._modes.rows(number)
+        mode, rows = self._modes.tracked[number], self._modes.rows(number)
+        head = self._modes.head(number, self.leader, self.log_weights)
         before, view = PoseGaussian(self.poses[head].copy(), mode.residual_covariance), self._view(head)
         matches = self._matcher.match(points, before, prediction, view)[: min(most, len(rows))]
         matches[0] = self._check(points, matches[0], head, mode, view)
@@ -210,7 +198,7 @@ class ParticleFilter:
             return [self._follow(rows, mode, matches[0], before.mean)]
         log_masses = np.array([match.log_mass for match in matches])
         log_mass, log_weight, groups = log_sum(log_masses), log_sum(self.log_weights[rows]), []
-        for part, match in zip(self._share_out(rows, head, log_masses - log_mass), matches, strict=True):
+        for part, match in zip(share_out(rows, head, log_masses - log_mass), matches, strict=True):
             self.log_weights[part] += log_weight + match.log_mass - log_mass - log_sum(self.log_weights[part])
             own = replace(mode, counted_evidence=mode.counted_evidence + match.log_evidence - log_mass)
             groups.append(self._follow(part, own, match, before.mean))
@@ -223,23 +211,13 @@ class ParticleFilter:
         leg = PoseGaussian(predicted, motion.covariance)
         return self._matcher.check_since_keyframe(points, match, leg, motion, view)
 
-    def _share_out(self, rows: Int64, head: int, log_masses: Float64) -> list[Int64]:
-        """The particles ``rows`` of a mode by the modes of its match, of which the first keeps the head."""
-        ordered = np.concatenate(([head], rows[rows != head]))
-        counts = allocate_particles(np.exp(log_masses), len(rows))
-        return np.split(ordered, np.cumsum(counts)[:-1])
-
     def _follow(self, rows: Int64, mode: TrackedMode, match: ScanMatch, before: Float64) -> _TrackedGroup:
         """Move particles by the motion from ``before``, the pose (3,) of their head, to a match."""
         step, increment = match.predicted_motion, se2.between(before, match.pose)
         self._predicted_poses[rows] = se2.compose(self._predicted_poses[rows], step.increment)
         self.poses[rows] = se2.compose(self.poses[rows], increment)
-        followed = TrackedMode(
-            mode.motion_since_update.compose(step),
-            self._matcher.covariance(match),
-            mode.counted_evidence,
-            bool(match.hessian.any()),
-        )
+        motion, residual = mode.motion_since_update.compose(step), self._matcher.covariance(match)
+        followed = TrackedMode(motion, residual, mode.counted_evidence, bool(match.hessian.any()))
         return _TrackedGroup(rows, followed, match, increment)
 
     def _tracking_covariance(self, group: _TrackedGroup) -> Float64:
@@ -248,13 +226,6 @@ class ParticleFilter:
         information = map_information(group.mode.motion_since_update.covariance, match.pose[2])
         information = information + match.hessian / self.mapping.alignment.inflation
         return rotate_covariance(matrix_inverse(information), -match.pose[2])
-
-    def _head(self, number: int) -> int:
-        return self._modes.head(number, self.leader, self.log_weights)
-
-    def _heads(self) -> list[int]:
-        """The head of each mode."""
-        return [self._head(number) for number in range(self._modes.count)]
 
     def _view(self, particle: int) -> GridView:
         return self.mapping.pool.view(self._tables[particle])
@@ -267,7 +238,7 @@ class ParticleFilter:
         if self._modes.count > 1:
             counted = np.array([mode.counted_evidence for mode in self._modes.tracked])
             self.log_weights = self.log_weights - counted[self._modes.members]
-            self._join_coinciding()
+            self._modes = self._modes.join_coinciding(self.poses, self.leader, self.log_weights)
         settings = self.mapping.configuration
         groups = [self._propose(number, prepared.surfels) for number in range(self._modes.count)]
         proposed, evidences = np.empty((len(self.poses), 3)), np.empty(len(self.poses))
@@ -278,17 +249,18 @@ class ParticleFilter:
             noise[group.rows] = np.einsum("mij,mj->mi", deviations, noise[group.rows])
         self.log_weights = self.log_weights + evidences
         self.log_weights -= self.log_weights.max()
-        leader = self._elect_leader()
+        leader = self._modes.elect_leader(self.leader, self.log_weights)
         leader_changed, self.leader = leader != self.leader, leader
         self.poses = proposed + noise
         # A head keeps its mode, so that the published path has no sampling noise.
-        heads = self._heads()
+        heads = self._modes.heads(leader, self.log_weights)
         self.poses[heads] = proposed[heads]
         self.poses[:, 2] = se2.wrap(self.poses[:, 2])
         increment = se2.between(self._last_poses[leader], self.poses[leader])
         error, information = self._assess(groups, heads)
         effective = 1.0 / float(np.sum(normalize_weights(self.log_weights) ** 2))
-        if effective < settings.filter.ess_fraction * len(self.poses) or self._has_refuted_mode():
+        refuted = self._modes.has_refuted(self.log_weights, self._least_share)
+        if effective < settings.filter.ess_fraction * len(self.poses) or refuted:
             self._resample(step)
         self._restart_prediction()
         return FilterStep(increment, error, information, effective, leader_changed, len(groups))
@@ -298,8 +270,9 @@ class ParticleFilter:
 
         :param points: surfels of the scan, shape (n, 4), base frame.
         """
-        settings, mode, head = self.mapping.configuration, self._modes.tracked[number], self._head(number)
-        rows, covariance, view = self._modes.rows(number), mode.motion_since_update.covariance, self._view(head)
+        settings, mode, rows = self.mapping.configuration, self._modes.tracked[number], self._modes.rows(number)
+        head = self._modes.head(number, self.leader, self.log_weights)
+        covariance, view = mode.motion_since_update.covariance, self._view(head)
         if not mode.shows_map and is_wide(covariance, settings.filter):
             # A match from here would end in some minimum, with a covariance that leaves the truth out.
             points = points[:0]
@@ -324,74 +297,27 @@ class ParticleFilter:
         """The error of the leader's motion, and the information (3, 3) of its match, in the light of all modes."""
         number = self._modes.number(self.leader)
         errors = [self._match_error(group, head) for group, head in zip(groups, heads, strict=True)]
-        hessian = _hessian(groups[number], self.leader)
         temper = self.mapping.configuration.matching.temper
-        information = rotate_covariance(temper * hessian, -self.pose[2])
+        information = rotate_covariance(temper * groups[number].hessian(self.leader), -self.pose[2])
         if len(groups) == 1:
             return errors[0], information
         shares, motions = self._modes.shares(self.log_weights), se2.between(self._last_poses[heads], self.poses[heads])
-        motion = motions[number]
-        error = MatchError(
-            mix_covariances(motion, motions, [error.pose_covariance for error in errors], shares),
-            mix_covariances(motion, motions, [error.drift_covariance for error in errors], shares),
-            np.einsum("k,kij->ij", shares, np.array([error.gain for error in errors])),
-        )
-        return error, blur_information(information, spread_about(motion, motions, shares))
+        mixture = MotionMixture(motions[number], motions, shares)
+        return mixture.mix_errors(errors), mixture.blur_information(information)
 
     def _match_error(self, group: _GroupProposals, head: int) -> MatchError:
-        return estimate_match_error(
-            group.static,
-            self.poses[head],
-            _hessian(group, head),
-            group.prior,
-            self._view(head),
-            self.mapping.alignment,
-            self.mapping.match_noise,
-        )
-
-    def _join_coinciding(self) -> None:
-        """Join modes whose heads are in one basin; of two, the one with the leader or the heavier one remains."""
-        shares, members = self._modes.shares(self.log_weights), self._modes.members
-        own = self._modes.number(self.leader)
-        order = sorted(range(self._modes.count), key=lambda number: (number != own, -shares[number]))
-        heads, kept = self._heads(), list[int]()
-        for number in order:
-            pose = self.poses[heads[number]]
-            into = next((other for other in kept if coincide(pose, self.poses[heads[other]])), None)
-            if into is None:
-                kept.append(number)
-            else:
-                members = np.where(members == number, into, members)
-        self._modes = self._modes.select(kept, members)
-
-    def _has_refuted_mode(self) -> bool:
-        """Whether a mode is less probable than an odometry fault."""
-        return self._modes.count > 1 and bool(self._modes.shares(self.log_weights).min() < self._least_share)
+        pose, hessian, view = self.poses[head], group.hessian(head), self._view(head)
+        alignment, noise = self.mapping.alignment, self.mapping.match_noise
+        return estimate_match_error(group.static, pose, hessian, group.prior, view, alignment, noise)
 
     def compare_scan(self, prepared: PreparedScan) -> MapAgreement:
         """Agreement of a scan with the leader's map, at its pose."""
-        return compare_with_map(
-            prepared.surfels, prepared.laser_position, self.pose, self._leading_view(), self.mapping.hit_distance
-        )
-
-    def _elect_leader(self) -> int:
-        """The particle of largest weight in the heaviest mode; the last mode and leader where none is clearly better.
-
-        Along a corridor all particles fit alike, and the pose would jump from one to the other.
-        """
-        rows = [self._modes.rows(number) for number in range(self._modes.count)]
-        log_shares = np.array([log_sum(self.log_weights[own]) for own in rows])
-        number, own = int(np.argmax(log_shares)), self._modes.number(self.leader)
-        if log_shares[number] - log_shares[own] > _LEAD_MARGIN:
-            return self._head(number)
-        heaviest = int(rows[own][np.argmax(self.log_weights[rows[own]])])
-        lead = self.log_weights[heaviest] - self.log_weights[self.leader]
-        return heaviest if lead > _LEAD_MARGIN else self.leader
+        view, hit_distance = self._leading_view(), self.mapping.hit_distance
+        return compare_with_map(prepared.surfels, prepared.laser_position, self.pose, view, hit_distance)
 
     def _restart_prediction(self) -> None:
         """Predict from the current poses."""
-        self._predicted_poses = self.poses.copy()
-        self._last_poses = self.poses.copy()
+        self._predicted_poses, self._last_poses = self.poses.copy(), self.poses.copy()
         self._modes = self._modes.after_filter_step()
 
     def initialize(self, pose: PoseGaussian) -> None:
@@ -400,40 +326,17 @@ class ParticleFilter:
         self.log_weights = np.zeros(len(self.poses))
         self.tracking_covariance = np.zeros((3, 3))
         self._restart_prediction()
-        self._modes = PoseModes.single(len(self.poses), replace(UNMOVED, residual_covariance=pose.covariance))
+        self._modes = PoseModes.single(len(self.poses), pose.covariance)
 
     def _resample(self, step: int) -> None:
-        """Systematic resampling within each mode; the leader is kept, and is the first particle afterwards.
-
-        Modes that are refuted end. The others have particles by their shares, one at least, and weights for the rest.
-        """
-        shares, own = self._modes.shares(self.log_weights), self._modes.number(self.leader)
-        kept = [number for number in range(len(shares)) if shares[number] >= self._least_share or number == own]
-        kept.sort(key=lambda number: number != own)
-        shares = shares[kept] / shares[kept].sum()
-        counts = allocate_particles(shares, len(self.poses))
+        """Resample the particles within each mode, without the refuted modes; maps are shared until written to."""
         offset = random_stream(self.mapping.configuration.seed, Purpose.RESAMPLING, step).random()
-        drawn = [self._draw(number, count, offset) for number, count in zip(kept, counts, strict=True)]
-        ancestors = np.concatenate(drawn)
+        drawn = self._modes.resample(self.leader, self.log_weights, self._least_share, offset)
+        ancestors, self.log_weights, self._modes = drawn
         tables = np.stack([self.mapping.pool.share(self._tables[a]) for a in ancestors])
         self.release()
-        self._tables = tables
+        self._tables, self.leader = tables, 0
         self.poses, self.keyframe_poses = self.poses[ancestors], self.keyframe_poses[ancestors]
-        self.log_weights = np.repeat(np.log(shares / counts), counts)
-        self.log_weights -= self.log_weights.max()
-        rows = np.split(np.arange(len(ancestors)), np.cumsum(counts)[:-1])
-        self._modes = PoseModes.from_rows(rows, [self._modes.tracked[number] for number in kept], len(ancestors))
-        self.leader = 0
-
-    def _draw(self, number: int, count: int, offset: float) -> Int64:
-        """``count`` particles of a mode by their weights, ascending; the leader is among them, and first."""
-        rows = self._modes.rows(number)
-        drawn = rows[draw_systematically(normalize_weights(self.log_weights[rows]), count, offset)]
-        if self._modes.number(self.leader) != number:
-            return drawn
-        if self.leader not in drawn:
-            drawn[0] = self.leader
-        return np.concatenate((drawn[drawn == self.leader], drawn[drawn != self.leader]))
 
     def add_keyframe(self, keyframe: int, scan: Scan) -> None:
         """Insert a scan into every particle's map at that particle's pose."""
@@ -453,9 +356,8 @@ class ParticleFilter:
         """Change to the frame of another area and load its local map, the same for all particles."""
         self._end_diverged_modes()
         self.area = area
-        self.poses = se2.compose(area_T_previous, self.poses)
-        self._predicted_poses = se2.compose(area_T_previous, self._predicted_poses)
-        self._last_poses = se2.compose(area_T_previous, self._last_poses)
+        previous = (self.poses, self._predicted_poses, self._last_poses)
+        self.poses, self._predicted_poses, self._last_poses = (se2.compose(area_T_previous, own) for own in previous)
         self._load_submap(content)
 
     def reload(self, content: Sequence[PlacedKeyframe], anchor: int) -> None:
@@ -468,22 +370,12 @@ class ParticleFilter:
         self.poses, self._predicted_poses, self._last_poses = (se2.compose(after, poses) for poses in relative)
 
     def _end_diverged_modes(self) -> None:
-        """End the modes whose keyframes lie elsewhere than the leader's, since their maps end.
-
-        Their particles go on from the leader. The covariances that the filter steps gave have what they differ by.
-        """
-        sources, kept = np.arange(len(self.poses)), list[int]()
-        for number, head in enumerate(self._heads()):
-            pairs = zip(self.keyframe_poses[head], self.leading_keyframe_poses(), strict=True)
-            if all(coincide(pose, leading) for pose, leading in pairs):
-                kept.append(number)
-            else:
-                sources[self._modes.rows(number)] = self.leader
-        if len(kept) == self._modes.count:
-            return
-        self._modes = self._modes.select(kept, self._modes.members[sources])
-        self.poses, self.keyframe_poses = self.poses[sources], self.keyframe_poses[sources]
-        self._predicted_poses, self._last_poses = self._predicted_poses[sources], self._last_poses[sources]
+        """End the modes whose maps end; the covariances that the filter steps gave have what they differ by."""
+        modes, sources = self._modes.end_diverged(self.keyframe_poses, self.leader, self.log_weights)
+        if modes.count < self._modes.count:
+            self._modes = modes
+            self.poses, self.keyframe_poses = self.poses[sources], self.keyframe_poses[sources]
+            self._predicted_poses, self._last_poses = self._predicted_poses[sources], self._last_poses[sources]
 
     def _load_submap(self, content: Sequence[PlacedKeyframe]) -> None:
         self.release()
@@ -496,12 +388,6 @@ class ParticleFilter:
         self.keyframe_areas = [keyframe.area for keyframe in content]
         poses = np.array([keyframe.pose for keyframe in content]).reshape(-1, 3)
         self.keyframe_poses = np.repeat(poses[None], count, axis=0)
-
-
-def _hessian(group: _GroupProposals, particle: int) -> Float64:
-    """Information of the points at the proposal of a particle, map coordinates, shape (3, 3)."""
-    hessian: Float64 = group.proposals.hessians[int(np.searchsorted(group.rows, particle))]
-    return hessian
 
 
 class ParticleFilters:
