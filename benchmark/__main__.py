@@ -59,6 +59,7 @@ MEASUREMENTS = {
     "kidnapping": "recovery of a robot that is kidnapped while it drives",
     "recorded": "closures, starts and displacements on recorded logs, right or wrong",
     "disambiguation": "path until a robot is sure of its place, driving to where a look decides, or on",
+    "merge": "maps of halves of a drive that are made apart and joined",
     "laps": "memory, cost and errors over repeated laps on known ground",
     "changes": "maps of changing worlds in mode lifelong, among people",
     "scale": "time and memory in maps of up to 100,000 areas",
@@ -74,6 +75,7 @@ MEASUREMENTS = {
 _MODULES = {
     "consistency": "calibration",
     "topology": "loops",
+    "merge": "merging",
     "sessions": "accuracy",
     "fuzz": "fuzz.measurement",
     "mutants": "mutants.measurement",

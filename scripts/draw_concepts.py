@@ -14,7 +14,7 @@ from pathlib import Path
 import matplotlib as mpl
 
 mpl.use("Agg")
-from concept_pictures import data_flow, scans, topology
+from concept_pictures import data_flow, scans, team, topology
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
@@ -38,6 +38,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "inference": topology.inference,
     "closure": topology.closure,
     "relocalization": topology.relocalization,
+    "team": team.team,
     "registration": scans.registration,
     "lifelong": scans.lifelong,
 }

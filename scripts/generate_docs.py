@@ -73,6 +73,7 @@ CONSTANT_FOLDERS = (
     "topological_inference",
     "loop_closure",
     "real_time_localization",
+    "team",
     "landmarks",
     "places",
     "exploration",

@@ -36,6 +36,7 @@ def build_parser() -> argparse.ArgumentParser:
         (_add_replay_arguments, "run_commands", "replay", "map a log by a simulated robot and the ROS nodes"),
         (_add_convert_arguments, "log_commands", "convert", "write a log as a rosbag2"),
         (_add_simulate_arguments, "log_commands", "simulate", "write a drive through a simulated world as a rosbag2"),
+        (_add_merge_arguments, "merge_commands", "merge", "join maps where they show the same ground"),
         (_add_evaluate_arguments, "result_commands", "evaluate", "errors of an output folder against true relations"),
         (_add_plot_arguments, "result_commands", "plot", "draw map, probabilities and cost of an output folder"),
         (_add_export_arguments, "result_commands", "export", "write a map's topology as GraphML, or its grid for nav2"),
@@ -158,6 +159,12 @@ def _add_simulate_arguments(command: argparse.ArgumentParser) -> None:
     )
     _add_storage(command)
     _add_time_window(command)
+
+
+def _add_merge_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument("maps", type=Path, nargs="+", metavar="MAP", help="output folders or hmt_maps, two or more")
+    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder; an old one is replaced")
+    _add_configuration(command)
 
 
 def _add_evaluate_arguments(command: argparse.ArgumentParser) -> None:

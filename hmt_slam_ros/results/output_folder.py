@@ -36,6 +36,9 @@ EARLIER_LOGS = "earlier"
 STAGES = "stages"
 """Folder of the trajectories before each step of the final refinement."""
 
+MERGE_REPORT = "merge.json"
+"""File that says how a map was made of several."""
+
 OUTPUT_FILES = frozenset(
     {
         "trajectory.tum",
@@ -48,6 +51,7 @@ OUTPUT_FILES = frozenset(
         LANDMARKS,
         PLACES,
         "report.json",
+        MERGE_REPORT,
         "pmf.csv",
         "pmf.png",
         "cost.csv",

@@ -28,6 +28,7 @@ from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.own_files import write_file
 from hmt_slam_ros.results.hmt_map import read_saved_map
 from hmt_slam_ros.results.pieces import MapPiece, image_corners, split_map
+from hmt_slam_ros.results.trajectories import Trajectory
 from hmt_slam_ros.untrusted_input import MAX_TEXT_BYTES, read_text
 
 Color = tuple[float, float, float]
@@ -63,9 +64,16 @@ def plot_map(directory: Path) -> Path:
     The extent is that of the grid and the keyframes. An ellipse that exceeds it is cut off at the frame, and hatched
     there. Pieces whose place in the map is unknown stand beside it, in frames of their own.
     """
+    return draw_map(directory, read_tum(directory / "trajectory.tum").poses)
+
+
+def draw_map(directory: Path, trajectory: Trajectory) -> Path:
+    """Draw map.png as :func:`plot_map` does.
+
+    :param trajectory: shape (n, 3), ``map_T_base`` of the last n scans of the map; a line ends at NaN.
+    """
     saved = read_saved_map(directory / "hmt_map")
     hybrid_map = saved.replica.maps[saved.replica.best_hypothesis]
-    trajectory = read_tum(directory / "trajectory.tum").poses
     pieces = split_map(directory, saved, trajectory)
     sizes = np.array([np.diff(piece.corners, axis=0)[0] for piece in pieces])
     widths = np.maximum(sizes[:, 0], _MIN_SHARE * sizes[:, 0].max())
@@ -212,7 +220,7 @@ def _frame_band(low: NDArray[np.float64], high: NDArray[np.float64]) -> PlotPath
 
 def _map_title(hybrid_map: HybridMap, path: NDArray[np.float64]) -> str:
     arcs = [arc for _, _, arc in hybrid_map.all_arcs()]
-    length = float(np.hypot(*np.diff(path, axis=0).T).sum())
+    length = float(np.nansum(np.hypot(*np.diff(path, axis=0).T)))
     closures = sum(arc.closure for arc in arcs)
     return f"areas: {len(hybrid_map.area_ids())}   arcs: {len(arcs)}   loop closures: {closures}   path: {length:.0f} m"
 

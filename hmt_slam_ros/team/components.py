@@ -1,0 +1,112 @@
+"""Components: the maps of several robots as one hybrid map, joined by arcs of which nothing is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.pose_graph import consistent_map
+from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
+from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions
+from hmt_slam_ros.sensors import Scan
+
+_GAP = 20.0
+"""Distance at which components are drawn beside one another while their place is unknown, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """A map as a part of the map of a team.
+
+    :ivar hybrid_map: its areas and arcs; it is not changed.
+    :ivar scans: {keyframe: scan} of its keyframes.
+    """
+
+    hybrid_map: HybridMap
+    scans: Mapping[int, Scan]
+
+    @classmethod
+    def of_map(cls, hybrid_map: HybridMap, scans: Mapping[int, Scan]) -> Component:
+        """The component of a whole map.
+
+        :param scans: of its keyframes at least.
+        """
+        areas = hybrid_map.area_ids()
+        return cls(
+            hybrid_map.subgraph(areas),
+            {keyframe: scans[keyframe] for area in areas for keyframe in hybrid_map.keyframes(area)},
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ComponentPair:
+    """Two components as one hybrid map. The second has the larger numbers of areas and of keyframes.
+
+    :ivar hybrid_map: of both, with an uninformative arc between their first areas.
+    :ivar scans: {keyframe: scan} of both.
+    :ivar known: areas of the first.
+    :ivar other: areas of the second.
+    :ivar first_keyframe: number from which on keyframes are those of the second.
+    :ivar area_shift: added to the numbers of the second's areas.
+    """
+
+    hybrid_map: HybridMap
+    scans: Mapping[int, Scan]
+    known: tuple[int, ...]
+    other: tuple[int, ...]
+    first_keyframe: int
+    area_shift: int
+
+    @property
+    def joint(self) -> tuple[int, int]:
+        """The areas between which the uninformative arc is."""
+        return self.known[0], self.other[0]
+
+
+def combine(first: Component, second: Component) -> ComponentPair:
+    """Two components, each with one area or more, as one hybrid map."""
+    area_shift = first.hybrid_map.max_area_id + 1
+    keyframe_shift = max(first.scans) + 1
+    shifted = renumber(second.hybrid_map, area_shift, keyframe_shift)
+    areas = first.hybrid_map.area_ids()
+    combined = first.hybrid_map.subgraph(areas)
+    for area in shifted.area_ids():
+        combined.changed_areas[area] = dict(shifted.keyframes(area))
+    combined.changed_arcs |= {(a, b): arc for a, b, arc in shifted.all_arcs()}
+    others = shifted.area_ids()
+    place = uninformative_belief(_pose_beside(first.hybrid_map, shifted))
+    combined.set_arc(areas[0], others[0], place, closure=False)
+    combined.commit()
+    scans = dict(first.scans) | {keyframe + keyframe_shift: scan for keyframe, scan in second.scans.items()}
+    return ComponentPair(combined, scans, tuple(areas), tuple(others), keyframe_shift, area_shift)
+
+
+def renumber(hybrid_map: HybridMap, area_shift: int, keyframe_shift: int) -> HybridMap:
+    """The same map with other numbers of its areas and keyframes.
+
+    :param area_shift: added to the number of each area; ``keyframe_shift`` to that of each keyframe.
+    """
+    shifted = HybridMap()
+    for area in hybrid_map.area_ids():
+        keyframes = hybrid_map.keyframes(area)
+        shifted.changed_areas[area + area_shift] = {k + keyframe_shift: pose for k, pose in keyframes.items()}
+    for a, b, arc in hybrid_map.all_arcs():
+        shifted.changed_arcs[a + area_shift, b + area_shift] = arc
+    shifted.commit()
+    return shifted
+
+
+def _pose_beside(first: HybridMap, second: HybridMap) -> Float64:
+    """A pose of the second map's first area in the first's, shape (3,), at which neither lies over the other."""
+    x = _positions(first)[:, 0].max() - _positions(second)[:, 0].min() + _GAP
+    return np.array([x, 0.0, 0.0])
+
+
+def _positions(hybrid_map: HybridMap) -> Float64:
+    """Positions of all keyframes in the frame of the first area, shape (n, 2), m."""
+    poses = consistent_map(hybrid_map).poses
+    return np.concatenate([keyframe_positions(hybrid_map, area, belief.mean) for area, belief in poses.items()])

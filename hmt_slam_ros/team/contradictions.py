@@ -1,0 +1,103 @@
+"""Contradictions between a window and the places of another component where a placement has it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.surroundings import (
+    AreaPlace,
+    GridCache,
+    Neighborhood,
+    containing_area,
+    keyframe_positions,
+    min_distance,
+    stack_poses,
+)
+from hmt_slam_ros.registration.area_to_area import MatchSettings, best_pose
+from hmt_slam_ros.registration.consistency import MAP_IN_MAP, MAPS_OUTLIER_RATE
+from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel
+from hmt_slam_ros.team.components import ComponentPair
+from hmt_slam_ros.team.placement import PlacementGeometry
+from hmt_slam_ros.team.windows import Window
+from hmt_slam_ros.topological_inference.place_recognition import MIN_LOG_RATIO
+
+_MAX_SIGMA = 2.0
+"""Largest deviation of a window that is compared, m: farther away it may be anywhere."""
+
+_MATCH_COVARIANCE = np.diag([0.25, 0.25, np.radians(4.0)]) ** 2
+"""Covariance within which a window is matched where its arcs are certain, m and rad, squared."""
+
+
+class PlaceComparison:
+    """Compares windows with what the first component saw, in both directions."""
+
+    def __init__(
+        self,
+        pair: ComponentPair,
+        windows: Sequence[Window],
+        geometry: PlacementGeometry,
+        configuration: Configuration,
+    ) -> None:
+        options = configuration.tsbi
+        self._pair, self._windows, self._geometry = pair, windows, geometry
+        neighborhood = Neighborhood(options.local_sigma, options.local_reach)
+        self._grid_cache = GridCache(pair.scans, GridModel.from_configuration(configuration), neighborhood)
+        self._settings = replace(MatchSettings.from_options(options), min_log_ratio=MIN_LOG_RATIO)
+        self._radius = options.place_radius
+
+    def log_ratio(self, window: int, area: int, belief: PoseGaussian, is_matched: bool) -> float:
+        """Log Bayes factor of the contradictions of a window, nats, at most 0; 0 where it lies in no place.
+
+        Surfaces of either side in the free space of the other contradict. Those of a window that was matched count in
+        one direction, since the match has the other one.
+
+        :param area: in which ``belief`` is over ``area_T_reference``.
+        """
+        if float(np.linalg.eigvalsh(belief.covariance[:2, :2]).max()) > _MAX_SIGMA**2:
+            return 0.0
+        poses = self._windows[window].poses
+        nearest, there = self._nearest_area(area, belief, poses)
+        if nearest is None:
+            return 0.0
+        place = self._grid_cache.place(self._pair.hybrid_map, nearest, (), self._pair.first_keyframe)
+        if containing_area(place, se2.compose(there.mean, stack_poses(poses)), self._radius) is None:
+            return 0.0
+        query = self._grid_cache.grid(poses)
+        if is_matched:
+            return min(0.0, _seen_from(query, place, there.mean))
+        pose = self._match(query, place, there)
+        forward = MAP_IN_MAP.log_likelihood_ratio(place.grid.compare(query.points, pose), MAPS_OUTLIER_RATE)
+        return min(0.0, forward + _seen_from(query, place, pose))
+
+    def _nearest_area(
+        self, area: int, belief: PoseGaussian, poses: Mapping[int, Float64]
+    ) -> tuple[int | None, PoseGaussian]:
+        """The area whose keyframes are nearest to a window, None beyond the radius of a place, and the belief in it."""
+        positions = se2.compose(belief.mean, stack_poses(poses))[:, :2]
+        distances = {
+            other: min_distance(positions, keyframe_positions(self._pair.hybrid_map, other, path.mean))
+            for other, path in self._geometry.paths(area).items()
+        }
+        nearest = min(distances, key=lambda other: (distances[other], other))
+        if distances[nearest] > self._radius:
+            return None, belief
+        return nearest, self._geometry.paths(nearest)[area].compose(belief)
+
+    def _match(self, query: AreaGrid, place: AreaPlace, belief: PoseGaussian) -> Float64:
+        """The best pose of a window within a belief; its mean where nothing fits."""
+        prior = PoseGaussian(belief.mean, belief.covariance + _MATCH_COVARIANCE)
+        found, _ = best_pose(query, place.grid, prior, self._settings)
+        return belief.mean if found is None else found[0]
+
+
+def _seen_from(query: AreaGrid, place: AreaPlace, pose: Float64) -> float:
+    """Log Bayes factor of the place's surfaces in what the window saw, nats."""
+    agreement = query.compare(place.grid.points, se2.inverse(pose))
+    return MAP_IN_MAP.log_likelihood_ratio(agreement, MAPS_OUTLIER_RATE)

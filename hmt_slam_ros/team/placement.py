@@ -1,0 +1,308 @@
+"""Placements: the PMF over how one component lies in another, "apart" included.
+
+Each window of the second component is searched in the first with a flat prior. A candidate of it implies a placement.
+Candidates of several windows that imply the same one, as far as the arcs between them tell, are one placement H:
+
+    log P(H) = log prior + l_best + S(H) - max(0, S_2),    S(H) = sum over the other windows of min(l, log 2.5)
+
+with l the log Bayes factor of a window, relative to ground that the first component does not have. Similar places stay
+similar for a while, so that agreement counts in full once, and contradictions always count. Of two placements one at
+least is false: the second largest S shows how far false ones agree in this building, and is no evidence
+(docs/decisions/0071-joining-two-maps.md).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
+from hmt_slam_ros.team.windows import Window
+from hmt_slam_ros.topological_inference.pose_distribution import UNMAPPED_PRIOR, PoseDistribution
+
+Pose = Float64
+
+APART_PRIOR = 0.5
+"""Prior probability that two components show no common ground, or none by which they could be joined."""
+
+MAX_AGREEMENT = math.log(2.5)
+"""Most that a window which agrees with a better one counts, nats (docs/decisions/0017-perceptual-aliasing.md)."""
+
+_GATE = chi_square_gate(0.999)
+"""Squared Mahalanobis distance up to which candidates of two windows agree."""
+
+_SAME_PLACE = np.diag([1.0, 1.0, math.radians(15.0)]) ** 2 / _GATE
+"""Covariance that the gate has with certain arcs: 1 m and 15 degrees are within it."""
+
+_MAX_PLACEMENTS = 32
+"""Most placements that are weighed: the others have less evidence at their best window."""
+
+_MIN_UNMAPPED = 1e-12
+"""Smallest probability of unmapped ground, for logarithms."""
+
+
+class WindowCandidate(NamedTuple):
+    """A pose of a window in the first component.
+
+    :ivar window: number of the window.
+    :ivar area: of the first component.
+    :ivar belief: over ``area_T_reference``, by the match alone.
+    :ivar log_ratio: log p(scans | there) / p(scans | unmapped ground), nats.
+    """
+
+    window: int
+    area: int
+    belief: PoseGaussian
+    log_ratio: float
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A way in which the second component may lie in the first.
+
+    :ivar pose: shape (3,), ``first_T_second``, of the frames of the components' first areas.
+    :ivar matches: {window: candidate} of those that agree, the best first.
+    :ivar best: log Bayes factor of the best window relative to unmapped ground, nats.
+    :ivar agreement: sum over the other windows, whose contradictions count in full.
+    :ivar probability: of the placement.
+    """
+
+    pose: Pose
+    matches: Mapping[int, WindowCandidate]
+    best: float
+    agreement: float
+    probability: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class PlacementDistribution:
+    """The PMF over placements.
+
+    :ivar placements: the most probable first.
+    :ivar apart: probability that the components have no common ground, or lie otherwise.
+    """
+
+    placements: tuple[Placement, ...]
+    apart: float
+
+    @property
+    def best(self) -> Placement | None:
+        """The most probable placement."""
+        return self.placements[0] if self.placements else None
+
+
+def window_candidates(number: int, distribution: PoseDistribution, areas: int) -> list[WindowCandidate]:
+    """The candidates of a window with their Bayes factors, from their probabilities and the flat prior.
+
+    :param number: of the window.
+    :param areas: number of areas over which the prior was flat.
+    """
+    unmapped = max(1.0 - float(distribution.probabilities.sum()), _MIN_UNMAPPED)
+    log_odds = math.log(UNMAPPED_PRIOR / (1.0 - UNMAPPED_PRIOR) * areas)
+    return [
+        WindowCandidate(number, c.area, c.mode.measured, math.log(p / unmapped) + log_odds)
+        for c, p in zip(distribution.candidates, distribution.probabilities.tolist(), strict=True)
+        if p > 0.0
+    ]
+
+
+class PlacementGeometry:
+    """Where windows lie in the first component if another window lies at a candidate, along the arcs of both."""
+
+    def __init__(self, hybrid_map: HybridMap, windows: Sequence[Window]) -> None:
+        """:param hybrid_map: of both components, between which no informative arc is."""
+        self._hybrid_map, self._windows = hybrid_map, windows
+        self._paths: dict[int, dict[int, PoseGaussian]] = {}
+
+    def paths(self, area: int) -> dict[int, PoseGaussian]:
+        """{other: belief over ``area_T_other``} of the areas of the same component."""
+        if area not in self._paths:
+            self._paths[area] = connected_areas(self._hybrid_map, area)
+        return self._paths[area]
+
+    def predict(self, window: int, matches: Mapping[int, WindowCandidate]) -> tuple[int, PoseGaussian] | None:
+        """An area of the first component, and the belief over ``area_T_reference`` of a window.
+
+        It follows from the match with the most certain path to the window, of equals the nearest one in time.
+
+        :param matches: {other window: candidate}, at least one.
+        :returns: None where no arcs lead to the window.
+        """
+        own = self._windows[window]
+        paths = self.paths(own.area)
+        reached = {m: paths[self._windows[m].area] for m in matches if self._windows[m].area in paths}
+        if not reached:
+            return None
+        near = min(reached, key=lambda m: (float(np.trace(reached[m].covariance[:2, :2])), abs(m - window), m))
+        between = (
+            PoseGaussian.from_pose(se2.inverse(self._windows[near].reference))
+            .compose(reached[near].inverse())
+            .compose(PoseGaussian.from_pose(own.reference))
+        )
+        return matches[near].area, matches[near].belief.compose(between)
+
+    def log_share(self, candidate: WindowCandidate, area: int, predicted: PoseGaussian) -> float | None:
+        """Log of the share of a predicted belief that a candidate has, None where it does not agree with it.
+
+        :param area: in which ``predicted`` is a belief over ``area_T_reference``.
+        """
+        paths = self.paths(candidate.area)
+        if area not in paths:
+            return None
+        there = paths[area].compose(predicted)
+        own = PoseGaussian(candidate.belief.mean, candidate.belief.covariance + _SAME_PLACE)
+        if there.mahalanobis2(own) > _GATE:
+            return None
+        spread = there.covariance_at(own.mean) + own.covariance
+        return min(0.0, 0.5 * float(np.linalg.slogdet(_SAME_PLACE)[1] - np.linalg.slogdet(spread)[1]))
+
+    def component_pose(self, first: int, second: int, match: WindowCandidate) -> Pose:
+        """``first_T_second`` of two areas, one of each component, if a window lies at a candidate, shape (3,)."""
+        window = self._windows[match.window]
+        first_T_reference = se2.compose(self.paths(first)[match.area].mean, match.belief.mean)
+        second_T_reference = se2.compose(self.paths(second)[window.area].mean, window.reference)
+        return se2.compose(first_T_reference, se2.inverse(second_T_reference))
+
+
+Comparison = Callable[[int, int, PoseGaussian, bool], float]
+"""Log Bayes factor, nats, at most 0, of the contradictions of a window where a placement has it.
+
+Its arguments are the window, an area of the first component, the belief over ``area_T_reference``, and whether the
+window was matched there.
+"""
+
+
+@dataclass
+class _Growth:
+    """A placement while windows are added to it.
+
+    :ivar matches: {window: candidate} of those that agree.
+    :ivar log_ratios: {window: log Bayes factor} of those that have a candidate there.
+    :ivar covered: candidates that imply the same placement, as (window, number).
+    """
+
+    matches: dict[int, WindowCandidate]
+    log_ratios: dict[int, float]
+    covered: set[tuple[int, int]] = field(default_factory=set)
+
+
+def placement_distribution(
+    geometry: PlacementGeometry,
+    candidates: Sequence[Sequence[WindowCandidate]],
+    joint: tuple[int, int],
+    known_areas: int,
+    compare: Comparison,
+) -> PlacementDistribution:
+    """The PMF over placements, from the candidates of all windows.
+
+    The prior is flat over the areas of the first component for each window of the second.
+
+    :param candidates: of each window.
+    :param joint: areas of the first and of the second component whose frames are those of the components.
+    :param known_areas: number of areas of the first component.
+    """
+    possible = max(1, known_areas * len(candidates))
+    placements = []
+    for grown in _grow_placements(geometry, candidates, min(possible, _MAX_PLACEMENTS)):
+        log_ratios = _with_contradictions(geometry, grown, len(candidates), compare)
+        matches = {w: grown.matches[w] for w in sorted(grown.matches, key=lambda w: (-log_ratios[w], w))}
+        pose = geometry.component_pose(*joint, next(iter(matches.values())))
+        placements.append(Placement(pose, matches, *_evidence(log_ratios)))
+    return weigh_placements(placements, possible)
+
+
+def weigh_placements(placements: Sequence[Placement], possible: int) -> PlacementDistribution:
+    """The PMF from the evidence of placements.
+
+    :param possible: number of placements over which the prior is flat, at least those that are given.
+    """
+    prior = (1.0 - APART_PRIOR) / possible
+    false_agreement = sorted([0.0, 0.0, *(each.agreement for each in placements)])[-2]
+    logs = np.array([math.log(prior) + each.best + each.agreement - false_agreement for each in placements])
+    weights = scipy.special.softmax(np.append(logs, math.log(1.0 - prior * len(placements)))).tolist()
+    weighed = [replace(each, probability=p) for each, p in zip(placements, weights[:-1], strict=True)]
+    return PlacementDistribution(tuple(sorted(weighed, key=lambda each: -each.probability)), weights[-1])
+
+
+def _grow_placements(
+    geometry: PlacementGeometry, candidates: Sequence[Sequence[WindowCandidate]], count: int
+) -> list[_Growth]:
+    """The placements of the candidates with the most evidence.
+
+    One that a better candidate of an earlier placement agrees with is that placement, with a window explained worse.
+    """
+    seeds = [(w, n) for w, own in enumerate(candidates) for n in range(len(own))]
+    seeds.sort(key=lambda seed: -candidates[seed[0]][seed[1]].log_ratio)
+    grown: list[_Growth] = []
+    covered: set[tuple[int, int]] = set()
+    for seed in seeds:
+        if len(grown) == count:
+            break
+        if seed in covered:
+            continue
+        growth = _grow(geometry, candidates, seed)
+        if not growth.covered & covered:
+            grown.append(growth)
+        covered |= growth.covered
+    return grown
+
+
+def _grow(
+    geometry: PlacementGeometry,
+    candidates: Sequence[Sequence[WindowCandidate]],
+    seed: tuple[int, int],
+) -> _Growth:
+    """The placement that a candidate implies, with the windows that agree, from the nearest in time on."""
+    first = candidates[seed[0]][seed[1]]
+    grown = _Growth({seed[0]: first}, {seed[0]: first.log_ratio})
+    for window in sorted(range(len(candidates)), key=lambda w: (abs(w - seed[0]), w)):
+        predicted = geometry.predict(window, grown.matches)
+        if predicted is None:
+            continue
+        log_shares = [geometry.log_share(candidate, *predicted) for candidate in candidates[window]]
+        agreeing = [n for n, log_share in enumerate(log_shares) if log_share is not None]
+        if not agreeing:
+            continue
+        log_ratios = {n: _log_mixture(log_shares[n] or 0.0, candidates[window][n].log_ratio) for n in agreeing}
+        best = max(agreeing, key=lambda n: log_ratios[n])
+        grown.covered |= {(window, n) for n in agreeing}
+        if window != seed[0]:
+            grown.log_ratios[window] = log_ratios[best]
+            if log_ratios[best] > 0.0:
+                grown.matches[window] = candidates[window][best]
+    return grown
+
+
+def _log_mixture(log_share: float, log_ratio: float) -> float:
+    """Log Bayes factor where a share of the belief is at a candidate, and the rest says nothing."""
+    return float(np.log1p(math.exp(log_share) * math.expm1(log_ratio)))
+
+
+def _with_contradictions(
+    geometry: PlacementGeometry, grown: _Growth, windows: int, compare: Comparison
+) -> dict[int, float]:
+    """{window: log Bayes factor} under a placement, contradictions included."""
+    log_ratios = dict(grown.log_ratios)
+    for window in range(windows):
+        match = grown.matches.get(window)
+        if match is not None:
+            log_ratios[window] += compare(window, match.area, match.belief, True)
+        elif window not in log_ratios:
+            predicted = geometry.predict(window, grown.matches)
+            log_ratios[window] = 0.0 if predicted is None else compare(window, *predicted, False)
+    return log_ratios
+
+
+def _evidence(log_ratios: Mapping[int, float]) -> tuple[float, float]:
+    """Log Bayes factor of the best window, and the sum of the others, of which agreement counts up to a bound."""
+    best = max(log_ratios.values())
+    return best, sum(min(each, MAX_AGREEMENT) for each in log_ratios.values()) - min(best, MAX_AGREEMENT)

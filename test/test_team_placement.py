@@ -1,0 +1,170 @@
+"""The PMF over placements, from hand-made distributions of windows."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
+from hmt_slam_ros.registration.area_to_area import MatchMode
+from hmt_slam_ros.registration.consistency import Agreement
+from hmt_slam_ros.team.placement import (
+    MAX_AGREEMENT,
+    PlacementGeometry,
+    WindowCandidate,
+    placement_distribution,
+    window_candidates,
+)
+from hmt_slam_ros.team.windows import Window
+from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
+from hmt_slam_ros.topological_inference.pose_distribution import UNMAPPED_PRIOR, PoseDistribution
+
+TIGHT = np.diag([0.02, 0.02, 0.005]) ** 2
+AREAS, WINDOWS = 4, 3
+SPACING = 10.0  # m between the areas of a component, along x
+TURNED = np.array([5.0, 20.0, 1.2])  # first_T_second
+
+
+def two_rows(drift=TIGHT):
+    """Areas 0 to 3 in a row, and 10 to 12 in another, with a window in each of these."""
+    hybrid_map, step = HybridMap(), np.array([SPACING, 0.0, 0.0])
+    for area in (*range(AREAS), *range(10, 10 + WINDOWS)):
+        hybrid_map.set_keyframe(area, area, np.zeros(3))
+    for area in range(AREAS - 1):
+        hybrid_map.set_arc(area, area + 1, PoseGaussian(step, TIGHT), closure=False)
+    for area in range(10, 9 + WINDOWS):
+        hybrid_map.set_arc(area, area + 1, PoseGaussian(step, drift), closure=False)
+    hybrid_map.set_arc(0, 10, uninformative_belief(np.zeros(3)), closure=False)
+    hybrid_map.commit()
+    windows = [Window(10 + w, np.array([0.5, 0.1, 0.3]), {10 + w: np.zeros(3)}) for w in range(WINDOWS)]
+    return PlacementGeometry(hybrid_map, windows), windows
+
+
+def match(windows, window, log_ratio, area=0, placement=TURNED, shift=(0.0, 0.0, 0.0)):
+    """The candidate of a window under a placement, seen from an area of the first component."""
+    second_T_reference = se2.compose([SPACING * window, 0.0, 0.0], windows[window].reference)
+    in_area = se2.between([SPACING * area, 0.0, 0.0], se2.compose(placement, second_T_reference))
+    return WindowCandidate(window, area, PoseGaussian(in_area + shift, TIGHT), log_ratio)
+
+
+def no_contradictions(*_):
+    return 0.0
+
+
+def distribution(geometry, candidates, compare=no_contradictions):
+    return placement_distribution(geometry, candidates, (0, 10), AREAS, compare)
+
+
+def odds(found):
+    """Log-odds of each placement to the prior weight of all that is not one of them."""
+    prior = 0.5 / (AREAS * WINDOWS)
+    rest = math.log(found.apart / (1.0 - prior * len(found.placements)))
+    return [math.log(each.probability / prior) - rest for each in found.placements]
+
+
+def test_components_without_a_candidate_are_apart():
+    geometry, _ = two_rows()
+    found = distribution(geometry, [[], [], []])
+    assert found.best is None and found.apart == 1.0
+
+
+def test_windows_that_agree_count_up_to_a_bound_beside_the_best():
+    geometry, windows = two_rows()
+    found = distribution(
+        geometry,
+        [[match(windows, 0, 4.0, 1)], [match(windows, 1, 5.0, 2)], [match(windows, 2, 0.5, 0)]],
+    )
+    assert len(found.placements) == 1
+    assert found.best.best == pytest.approx(5.0)
+    # The arcs leave a share of where the third window is to other places.
+    assert MAX_AGREEMENT + 0.2 < found.best.agreement < MAX_AGREEMENT + 0.5
+    assert list(found.best.matches) == [1, 0, 2]
+    np.testing.assert_allclose(found.best.pose, TURNED, atol=1e-9)
+    assert odds(found) == pytest.approx([found.best.best + found.best.agreement])
+    assert sum(each.probability for each in found.placements) + found.apart == pytest.approx(1.0)
+
+
+def test_a_candidate_beyond_a_meter_is_another_placement():
+    geometry, windows = two_rows()
+    near = [[match(windows, 0, 4.0)], [match(windows, 1, 3.0, shift=(0.5, 0.0, 0.0))], []]
+    far = [[match(windows, 0, 4.0)], [match(windows, 1, 3.0, shift=(1.5, 0.0, 0.0))], []]
+    assert len(distribution(geometry, near).placements) == 1
+    assert len(distribution(geometry, far).placements) == 2
+
+
+def test_drift_does_not_split_a_placement():
+    geometry, windows = two_rows(drift=np.diag([0.8, 0.8, 0.02]) ** 2)
+    found = distribution(geometry, [[match(windows, 0, 4.0)], [match(windows, 1, 3.0, shift=(1.5, 0.0, 0.0))], []])
+    assert len(found.placements) == 1 and len(found.best.matches) == 2
+
+
+def test_of_two_equal_placements_neither_is_sure():
+    geometry, windows = two_rows()
+    other = np.array([-40.0, 3.0, -2.0])
+    both = [[match(windows, w, 5.0), match(windows, w, 5.0, placement=other)] for w in range(WINDOWS)]
+    found = distribution(geometry, both)
+    assert [each.probability for each in found.placements] == pytest.approx([found.best.probability] * 2)
+    # What the false one of them agrees is no evidence.
+    assert odds(found) == pytest.approx([5.0, 5.0])
+
+
+def test_a_placement_stands_out_by_what_it_agrees_more_than_false_ones():
+    geometry, windows = two_rows()
+    other = np.array([-40.0, 3.0, -2.0])
+    found = distribution(
+        geometry,
+        [
+            [match(windows, 0, 5.0), match(windows, 0, 4.0, placement=other)],
+            [match(windows, 1, 5.0)],
+            [],
+        ],
+    )
+    assert odds(found) == pytest.approx([5.0 + MAX_AGREEMENT, 4.0])
+
+
+def test_contradictions_count_in_full():
+    geometry, windows = two_rows()
+
+    def contradict(window, _area, _belief, is_matched):
+        assert is_matched == (window < 2)
+        return -7.0 if window == 2 else 0.0
+
+    found = distribution(geometry, [[match(windows, 0, 5.0)], [match(windows, 1, 5.0)], []], contradict)
+    assert odds(found) == pytest.approx([5.0 + MAX_AGREEMENT - 7.0])
+
+
+def test_windows_are_compared_where_the_placement_has_them():
+    geometry, windows = two_rows()
+    compared = {}
+
+    def note(window, area, belief, _is_matched):
+        compared[window] = se2.compose([SPACING * area, 0.0, 0.0], belief.mean)
+        return 0.0
+
+    distribution(geometry, [[match(windows, 0, 5.0, 1)], [], []], note)
+    for window, pose in compared.items():
+        expected = match(windows, window, 0.0).belief.mean
+        np.testing.assert_allclose(pose, expected, atol=1e-9)
+    assert compared.keys() == {0, 1, 2}
+
+
+def test_the_order_of_candidates_does_not_matter():
+    geometry, windows = two_rows()
+    other = np.array([-40.0, 3.0, -2.0])
+    own = [[match(windows, w, 5.0 - w), match(windows, w, 2.0 + w, placement=other)] for w in range(WINDOWS)]
+    found, turned = distribution(geometry, own), distribution(geometry, [each[::-1] for each in own])
+    assert [each.probability for each in found.placements] == [each.probability for each in turned.placements]
+
+
+def test_the_factor_of_a_window_does_not_depend_on_its_flat_prior():
+    likelihoods, areas = np.array([30.0, 2.0, 0.1]), 5
+    belief = PoseGaussian(np.zeros(3), TIGHT)
+    candidates = tuple(PoseCandidate(a, MatchMode(belief, belief, 0.0), Agreement(0, 0, 0)) for a in range(3))
+    weights = (1.0 - UNMAPPED_PRIOR) / areas * likelihoods
+    known = PoseDistribution(candidates, weights / (weights.sum() + UNMAPPED_PRIOR))
+    found = window_candidates(3, known, areas)
+    np.testing.assert_allclose([each.log_ratio for each in found], np.log(likelihoods))
+    assert {each.window for each in found} == {3}
