@@ -174,7 +174,7 @@ def continued_records(robot: DrivenRobot, question: OpenQuestion) -> Iterator[Lo
 
 
 def measure_disambiguation(settings: Settings) -> Report:
-    """DecidingDrive on from the questions of all worlds, in three ways."""
+    """Drive on from the questions of all worlds, in three ways."""
     cases = chosen_families(settings, CASES)
     seeds = chosen_seeds(settings, SEEDS)
     worlds = [(case, seed) for case in cases for seed in seeds]
