@@ -78,7 +78,7 @@ class Merged:
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class _Half:
     """A part of a log: its name, its map and the true poses of the whole log."""
 
     family: str
@@ -109,7 +109,7 @@ def measure_merge(settings: Settings) -> Report:
     return report
 
 
-def _recorded_halves(settings: Settings, log: MeasuredLog) -> list[tuple[_Part, _Part]]:
+def _recorded_halves(settings: Settings, log: MeasuredLog) -> list[tuple[_Half, _Half]]:
     """The two parts of a recorded log at every cut."""
     whole = Case(log, 0, changes=settings.changes)
     duration = open_log(log.path).duration
@@ -124,7 +124,7 @@ def _recorded_halves(settings: Settings, log: MeasuredLog) -> list[tuple[_Part, 
     ]
 
 
-def _simulated_halves(settings: Settings, world: World) -> list[tuple[_Part, _Part]]:
+def _simulated_halves(settings: Settings, world: World) -> list[tuple[_Half, _Half]]:
     """The two laps of a drive."""
     log, simulated = MeasuredLog(world.name, Path(world.log)), open_log(world.log)
     half = 0.5 * simulated.duration
@@ -135,12 +135,12 @@ def _simulated_halves(settings: Settings, world: World) -> list[tuple[_Part, _Pa
     return [_pair_of(world.family, world.name, settings.runner.runs(cases), read_true_poses(simulated))]
 
 
-def _pair_of(family: str, name: str, runs: Sequence[Run], truth: StampedPoses) -> tuple[_Part, _Part]:
-    first, second = (_Part(family, name, run.folder, truth) for run in runs)
+def _pair_of(family: str, name: str, runs: Sequence[Run], truth: StampedPoses) -> tuple[_Half, _Half]:
+    first, second = (_Half(family, name, run.folder, truth) for run in runs)
     return first, second
 
 
-def _merge(settings: Settings, first: _Part, second: _Part, *, is_foreign: bool) -> Merged:
+def _merge(settings: Settings, first: _Half, second: _Half, *, is_foreign: bool) -> Merged:
     """Merge two maps by their largest pieces, and compare with the truth."""
     robots = read_team([first.folder, second.folder])
     one, other = (_largest(robot) for robot in robots)
@@ -167,7 +167,7 @@ def _largest(robot: RobotMap) -> Component:
     return max(robot.components.values(), key=lambda component: len(component.scans))
 
 
-def _window_errors(met: Meeting, placement: Placement, first: _Part, second: _Part) -> Float64:
+def _window_errors(met: Meeting, placement: Placement, first: _Half, second: _Half) -> Float64:
     """Distance, m, and angle, rad, of every window of a placement from the truth, shape (n, 2)."""
     errors = []
     for number, match in placement.matches.items():
@@ -179,7 +179,7 @@ def _window_errors(met: Meeting, placement: Placement, first: _Part, second: _Pa
     return np.array(errors)
 
 
-def _true_pose(met: Meeting, part: _Part, keyframe: int) -> Float64:
+def _true_pose(met: Meeting, part: _Half, keyframe: int) -> Float64:
     stamps = np.array([met.pair.scans[keyframe].stamp])
     return np.asarray(part.truth.poses[part.truth.nearest_indices(stamps)[0]], dtype=np.float64)
 

@@ -49,7 +49,7 @@ def test_training_and_validation_have_no_seed_in_common():
         seeds(101, training=True)
 
 
-def test_seeds_that_nobody_looked_at_begin_where_they_are_asked_for():
+def test_fresh_seeds_begin_at_the_first_that_is_given():
     assert seeds(3, 2000, training=False) == (2000, 2001, 2002)
     assert seeds(2, 98, training=True) == (98, 99)
     with pytest.raises(HmtSlamError, match="there are 100 training seeds: 101 are too many"):

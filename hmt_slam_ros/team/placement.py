@@ -8,7 +8,7 @@ Candidates of several windows that imply the same one, as far as the arcs betwee
 with l the log Bayes factor of a window, relative to ground that the first component does not have. Similar places stay
 similar for a while, so that agreement counts in full once, and contradictions always count. Of two placements one at
 least is false: the second largest S shows how far false ones agree in this building, and is no evidence
-(docs/decisions/0071-joining-two-maps.md).
+(docs/decisions/0070-joining-two-maps.md).
 """
 
 from __future__ import annotations
