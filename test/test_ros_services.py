@@ -32,6 +32,7 @@ SAID = {f"/{topic.lstrip('/')}" for topic in {*NAMED, *topics.DOCUMENTS.values()
     "/ground_truth",  # of a robot that is driven
     *("/goal_pose", "/pilot/place_estimate"),  # of explorer and pilot
     "/hmt/notices",  # as there is nothing to complain of
+    *("/hmt/ambiguity", "/hmt/ambiguity_goal"),  # as one hypothesis is probable
 }
 
 

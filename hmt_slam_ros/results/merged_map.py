@@ -123,7 +123,7 @@ def write_merged(directory: Path, robots: Sequence[RobotMap], team: TeamMap, con
     (directory / MERGE_REPORT).write_text(report + "\n", encoding="utf-8")
     from hmt_slam_ros.results.plots import draw_map  # noqa: PLC0415  matplotlib takes long to load
 
-    draw_map(directory, _path(relative, starts, hybrid_map, area_poses))
+    draw_map(directory, read_saved_map(map_folder(directory)), _path(relative, starts, hybrid_map, area_poses))
 
 
 def _write_grid(

@@ -26,7 +26,7 @@ from hmt_slam_ros.grids.occupancy_map import OCCUPIED, UNKNOWN, OccupancyImage
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.own_files import write_file
-from hmt_slam_ros.results.hmt_map import read_saved_map
+from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
 from hmt_slam_ros.results.pieces import MapPiece, image_corners, split_map
 from hmt_slam_ros.results.trajectories import Trajectory
 from hmt_slam_ros.untrusted_input import MAX_TEXT_BYTES, read_text
@@ -64,15 +64,16 @@ def plot_map(directory: Path) -> Path:
     The extent is that of the grid and the keyframes. An ellipse that exceeds it is cut off at the frame, and hatched
     there. Pieces whose place in the map is unknown stand beside it, in frames of their own.
     """
-    return draw_map(directory, read_tum(directory / "trajectory.tum").poses)
+    saved = read_saved_map(directory / "hmt_map")
+    return draw_map(directory, saved, read_tum(directory / "trajectory.tum").poses)
 
 
-def draw_map(directory: Path, trajectory: Trajectory) -> Path:
+def draw_map(directory: Path, saved: SavedMap, trajectory: Trajectory) -> Path:
     """Draw map.png as :func:`plot_map` does.
 
+    :param saved: the map in the folder.
     :param trajectory: shape (n, 3), ``map_T_base`` of the last n scans of the map; a line ends at NaN.
     """
-    saved = read_saved_map(directory / "hmt_map")
     hybrid_map = saved.replica.maps[saved.replica.best_hypothesis]
     pieces = split_map(directory, saved, trajectory)
     sizes = np.array([np.diff(piece.corners, axis=0)[0] for piece in pieces])
