@@ -15,7 +15,7 @@ from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative, uninformativ
 from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
-from hmt_slam_ros.topological_inference import event_work, relocalization
+from hmt_slam_ros.topological_inference import event_work, relocalization, relocalization_arcs
 from hmt_slam_ros.topological_inference.branches import Branches, Parent
 from hmt_slam_ros.topological_inference.candidate_gating import CandidateGating
 from hmt_slam_ros.topological_inference.event_work import EventWork
@@ -475,14 +475,14 @@ def test_the_area_of_a_lost_robot_is_drawn_where_it_agrees_with_the_hint():
     hybrid_map = make_map()
     hybrid_map.set_arc(0, 5, uninformative_belief(np.array([1.0, 1.0, 1.0])), closure=False)
     parent, hint = make_parent(Lost(20), hybrid_map), PoseHint(23, 1, PoseGaussian(np.array([4.0, 2.0, 0.5]), SHARP))
-    np.testing.assert_allclose(relocalization._hinted_pose(parent, 0, hint), se2.compose(ARC, hint.pose.mean))
-    np.testing.assert_array_equal(relocalization._hinted_pose(parent, 2, hint), hint.pose.mean)
+    np.testing.assert_allclose(relocalization_arcs.hinted_pose(parent, 0, hint), se2.compose(ARC, hint.pose.mean))
+    np.testing.assert_array_equal(relocalization_arcs.hinted_pose(parent, 2, hint), hint.pose.mean)
     pose = hybrid_map.keyframes(5)[23]
-    (arc,) = relocalization._hinted_arcs(parent, 20, hint, pose)
+    (arc,) = relocalization_arcs.hinted_arcs(parent, 20, hint, pose)
     assert (arc.source, arc.target) == (0, 5)
     np.testing.assert_allclose(se2.compose(arc.pose.mean, pose), se2.compose(ARC, hint.pose.mean))
     np.testing.assert_array_equal(arc.pose.covariance, uninformative_belief(np.zeros(3)).covariance)
-    assert relocalization._hinted_arcs(parent, 21, hint, pose) == ()
+    assert relocalization_arcs.hinted_arcs(parent, 21, hint, pose) == ()
 
 
 def test_an_initial_pose_of_a_lost_robot_is_that_of_its_newest_keyframe():

@@ -283,7 +283,7 @@ def _grow(
 
 
 def _log_mixture(log_share: float, log_ratio: float) -> float:
-    """Log Bayes factor where a share of the belief is at a candidate, and the rest says nothing."""
+    """Log Bayes factor where a share of the belief is at a candidate, and the rest is uninformative."""
     return float(np.log1p(math.exp(log_share) * math.expm1(log_ratio)))
 
 

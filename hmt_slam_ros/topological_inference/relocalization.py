@@ -9,7 +9,7 @@ decides on it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from hmt_slam_ros.configuration.topology import InferenceParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative, shortest_path_beliefs, uninformative_belief
+from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.messages.map_changes import Arc, InitialPose
 from hmt_slam_ros.messages.messages import Keyframe
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
@@ -28,6 +28,7 @@ from hmt_slam_ros.topological_inference.global_localization import GlobalSearch,
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate, is_certain
 from hmt_slam_ros.topological_inference.hypothesis_tree import Lost, PoseInArea, Tracking
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
+from hmt_slam_ros.topological_inference.relocalization_arcs import hinted_arcs, hinted_pose, refuted_arcs
 
 Pose = Float64
 
@@ -98,7 +99,7 @@ def _enter_unknown_area(
     hint = None
     if initial_pose is not None and parent.hybrid_map.has_area(initial_pose.area):
         hint = PoseHint(keyframe, initial_pose.area, initial_pose.pose)
-    drawn = None if hint is None else _hinted_pose(parent, parent.area, hint)
+    drawn = None if hint is None else hinted_pose(parent, parent.area, hint)
     child = branching.entry.enter_unknown(parent, query, 0.0, drawn)
     before = child.state.localization
     before = before if isinstance(before, Lost) else Lost(keyframe)
@@ -122,39 +123,8 @@ def _relocalize_at_hint(
     lost = replace(lost, pose_hint=hint, false_alarm=None, search=None, plausible_areas=frozenset(), unknown=-1)
     hinted = _with_localization(parent, lost)
     branches = update_relocalization(branching, hinted)
-    arcs = _hinted_arcs(parent, lost.since, hint, keyframes[newest])
+    arcs = hinted_arcs(parent, lost.since, hint, keyframes[newest])
     return branches._replace(children=[replace(child, arcs=child.arcs or arcs) for child in branches.children])
-
-
-def _hinted_pose(parent: Parent, area: int, pose_hint: PoseHint) -> Pose:
-    """The mean of a pose hint in the frame of another area, ``area_T_base``, shape (3,)."""
-    between = shortest_path_beliefs(parent.hybrid_map, area, targets=(pose_hint.area,)).get(pose_hint.area)
-    return pose_hint.pose.mean if between is None else se2.compose(between.mean, pose_hint.pose.mean)
-
-
-def _hinted_arcs(parent: Parent, since: int, pose_hint: PoseHint, pose: Pose) -> tuple[Arc, ...]:
-    """The uninformative arc with the mean at which the areas since then agree with a pose hint.
-
-    :param pose: ``area_T_base`` of the hint's keyframe, in the robot's area.
-    """
-    for known, new, arc in _arcs_from_before(parent, since):
-        if is_uninformative(arc):
-            mean = se2.compose(_hinted_pose(parent, known, pose_hint), se2.between(pose, _area_frame(parent, new)))
-            return (Arc(known, new, uninformative_belief(mean)),)
-    return ()
-
-
-def _arcs_from_before(parent: Parent, since: int) -> Iterator[tuple[int, int, PoseGaussian]]:
-    """The arcs by which the areas of before and those since a keyframe are joined: (known, new, ``known_T_new``)."""
-    for known, new, arc in parent.hybrid_map.all_arcs():
-        first, second = (min(parent.hybrid_map.keyframes(area), default=-1) for area in (known, new))
-        if first < since <= second:
-            yield known, new, arc.pose
-
-
-def _area_frame(parent: Parent, area: int) -> Pose:
-    """``robot_area_T_area`` of an area that arcs join to the robot's, shape (3,)."""
-    return shortest_path_beliefs(parent.hybrid_map, parent.area, targets=(area,))[area].mean
 
 
 def is_search_due(parent: Parent, options: InferenceParameters) -> bool:
@@ -314,31 +284,12 @@ def _split_at_candidate(
         log_weight=parent.log_weight + math.log(probability),
         arcs=(
             Arc(parent.area, candidate.area, belief, True),
-            *_refuted_arcs(parent, lost, candidate.area, belief, gate),
+            *refuted_arcs(parent, lost, candidate.area, belief, gate),
         ),
         reload_local_map=True,
     )
     log_weight = parent.log_weight + math.log(max(1.0 - probability, 1e-300))
     return [replace(still_lost, log_weight=log_weight), relocalized]
-
-
-def _refuted_arcs(parent: Parent, lost: Lost, known: int, belief: PoseGaussian, gate: float) -> tuple[Arc, ...]:
-    """The arcs into the areas since the robot was lost that do not admit the pose found, as uninformative ones.
-
-    It was moved before the first keyframe of these areas then, and the arc says nothing.
-
-    :param known: the area in which the robot was found.
-    :param belief: over ``robot_area_T_known``.
-    """
-    refuted = []
-    for before, new, arc in _arcs_from_before(parent, lost.since):
-        to_known = shortest_path_beliefs(parent.hybrid_map, before, targets=(known,)).get(known)
-        if to_known is None or is_uninformative(arc):
-            continue
-        found = to_known.compose(belief.inverse()).compose(PoseGaussian.from_pose(_area_frame(parent, new)))
-        if arc.mahalanobis2(found) > gate:
-            refuted.append(Arc(before, new, uninformative_belief(found.mean)))
-    return tuple(refuted)
 
 
 def _child_with_localization(parent: Parent, localization: Tracking | Lost) -> Child:
