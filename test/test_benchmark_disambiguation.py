@@ -100,7 +100,7 @@ def test_the_measurements_of_the_driven_robot_continue_those_of_the_route():
 
 
 def test_from_a_question_in_twin_rooms_the_run_goes_on_in_three_ways():
-    found = find_question_drives(("twins", 50))
+    found = find_question_drives(("twins", 51))
     assert found is not None
     assert set(found.drives) == {DISAMBIGUATING, EXPLORING, ROUTE}
     assert found.drives[DISAMBIGUATING].verdict == "right"

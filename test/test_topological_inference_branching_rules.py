@@ -301,11 +301,18 @@ def test_where_arcs_are_wide_keyframes_begin_an_area_at_once_and_are_compared_th
     np.testing.assert_allclose(arc.pose.mean, se2.inverse(fit(6, 0.0).mode.measured.mean))
 
 
-def test_behind_a_wide_heading_keyframes_are_not_compared_with_areas_where_the_robot_is_searched():
+@pytest.mark.parametrize("condition", ["after_gap", "uncertain", None])
+def test_behind_a_wide_heading_after_a_fault_keyframes_are_not_compared_where_the_robot_is_searched(condition):
     given = GivenComparison(AreaComparison(Transition({6: 0.6}, 0.4), (fit(6, -2.0),), (6,), (), 0.0), 1)
-    branching, parent = given.branching(), make_parent()
+    branching, parent = given.branching(), make_parent(onset_conditions={14: condition} if condition else {})
     wide = {**parent.state.covariances, 14: np.diag([0.1, 0.1, 0.8]) ** 2}
-    (child,) = branching.cut(replace(parent, state=replace(parent.state, covariances=wide)), [14]).children
+    lost, *others = branching.cut(replace(parent, state=replace(parent.state, covariances=wide)), [14]).children
+    assert lost.area == 7
+    assert lost.state.is_lost
+    assert [child.area for child in others] == ([] if condition else [6])
+    if condition is None:
+        return
+    child = lost
     assert (child.area, child.log_weight, child.state.is_lost) == (7, -0.7, True)
     assert child.state.comparison is None
     assert given.requested == []

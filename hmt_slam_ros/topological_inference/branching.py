@@ -236,8 +236,12 @@ class Branching:
         return self._branch_at_cut(parent, query, found)
 
     def _cut_behind_wide_arc(self, parent: Parent, query: Query) -> Branches:
-        """The children of a cut to which a wide motion led; a robot that is lost there is searched, not compared."""
-        if self.entry.is_lost_beyond(parent, query):
+        """The children of a cut to which a wide motion led.
+
+        A robot that is lost after a fault of odometry or a gap is searched, not compared: arcs may say where it is not.
+        """
+        is_after_fault = next(iter(query.poses)) in parent.state.onset_conditions
+        if is_after_fault and self.entry.is_lost_beyond(parent, query):
             return Branches([self.entry.enter_new(parent, query, 0.0)])
         found = self._compare_cut(parent, query, {parent.area})
         if isinstance(found, OngoingComparison):
