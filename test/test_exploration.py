@@ -17,13 +17,14 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import Explorer
 from hmt_slam_ros.exploration.frontiers import NavigationGrid
 from hmt_slam_ros.exploration.local_motion import MotionCommand, MotionLimits, command_towards
+from hmt_slam_ros.exploration.look_planner import LookPlanner
 from hmt_slam_ros.exploration.path_follower import PathFollower
 from hmt_slam_ros.exploration.roadmap import Frontier, Roadmap, classify_place, crosses_doors
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.landmarks.openings import distance_to_doors, jamb_positions
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.messages.ambiguity import Ambiguity, Look
+from hmt_slam_ros.messages.ambiguity import NOT_DRIVEN, Ambiguity, Look
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, HypothesisEstimate, Keyframe
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.tasks import EXPLORER_TASKS, GoalPose, Task, TaskResult, VelocityCommand, parse_task
@@ -203,6 +204,37 @@ def test_looks_that_came_before_their_map_wait() -> None:
     ahead = replace(ambiguity_along(own, way_to(own, "room 1")), sequence=own.run.driver.exploration_map.event + 2)
     own.run.driver.handle(ahead)
     assert completed_task(own.run.run_task(Task("disambiguate"), 0.4)).text == "disambiguate: the place is sure"
+
+
+def test_a_goal_is_kept_while_a_look_there_tells_half_as_much_per_meter() -> None:
+    """Else a robot between two looks that tell the same drives to and fro, as the rates change with its place."""
+    own = explore(2)
+    atlas = own.run.driver.exploration_map
+    here, locator, robot = atlas.update_roadmap(), atlas.keyframe_locator, atlas.pose.pose_in_area.mean
+    assert here is not None
+    keyframes = [
+        max(way_to(own, place), key=lambda k: np.hypot(*(locator.keyframe_pose(k) - robot)[:2]))
+        for place in ("room 1", "room 2")
+    ]
+    (area, first), (other, second) = (locator.area_and_pose(keyframe) for keyframe in keyframes)
+    event = atlas.event
+
+    def kept(information: float, *, remains: bool = True) -> bool:
+        """Whether a robot on its way to the first look keeps it for a second one of this information."""
+        planner = LookPlanner()
+        look = Look(area, first, 0.3, 10.0, NOT_DRIVEN)
+        planner.add(Ambiguity(event, 0.6, (look,), ""))
+        planner.update(event)
+        assert planner.plan(locator, here.keyframe, robot) is not None
+        looks = (look, Look(other, second, information, 10.0, NOT_DRIVEN))[not remains :]
+        planner.add(Ambiguity(event, 0.6, looks, ""))
+        planner.update(event)
+        return planner.keeps_target(locator, robot[:2])
+
+    assert kept(0.4)
+    assert kept(0.59)
+    assert not kept(0.61)
+    assert not kept(0.2, remains=False)
 
 
 def test_an_exploration_is_interrupted_for_looks_where_that_is_wanted() -> None:

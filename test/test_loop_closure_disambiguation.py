@@ -27,14 +27,14 @@ RIGHT = LEFT * (1.0, -1.0, 1.0, -1.0)
 PATH = [(x, 0.0, 0.0) for x in np.arange(-5.0, 19.0, 1.0)]
 
 
-def replica_of(*hypotheses, probabilities=None):
+def replica_of(*hypotheses, probabilities=None, scan_at=worlds.scan_at):
     """The hypotheses have the robot in areas of their own: each is (walls, keyframe poses in the area)."""
     scans, maps, number = {}, {}, 0
     for h, (walls, poses) in enumerate(hypotheses):
         maps[h] = HybridMap()
         for pose in poses:
             maps[h].set_keyframe(number, h, np.array(pose))
-            scans[number] = worlds.scan_at(walls, pose)
+            scans[number] = scan_at(walls, pose)
             number += 1
     probabilities = probabilities or [1.0 / len(hypotheses)] * len(hypotheses)
     return Replica(scans, maps, dict(enumerate(probabilities)), {h: h for h in maps})
@@ -90,6 +90,28 @@ def test_keyframes_elsewhere_in_equal_places_tell_hardly_anything():
     shifted = [(x + 0.4, 0.1, 0.3) for x, _, _ in PATH]
     found = ambiguity_of(replica_of((LEFT, PATH), (LEFT, shifted)))
     assert found.best_look() is None
+
+
+def test_a_laser_that_sees_half_a_circle_tells_what_is_ahead_of_the_robot_there():
+    """All keyframes look along +x. On the way back a robot knows what it would see only where they were behind it."""
+
+    def information_at(x, scan_at, pose):
+        found = ambiguity_of(replica_of((LEFT, PATH), (RIGHT, PATH), scan_at=scan_at), pose)
+        return next(look.information for look in found.looks if abs(look.pose[0] - x) < 0.1)
+
+    there, back = (0.0, 0.0, 0.0), (18.0, 0.0, math.pi)
+    for scan_at in (worlds.scan_at, worlds.scan_in):
+        assert information_at(6.0, scan_at, there) > 0.5
+    assert information_at(12.0, worlds.scan_at, back) > 0.5
+    assert information_at(12.0, worlds.scan_in, back) < 1e-9
+    assert information_at(9.0, worlds.scan_in, back) > 0.5
+
+
+def test_a_look_heads_along_its_path():
+    found = ambiguity_of(replica_of((LEFT, PATH), (RIGHT, PATH)), (10.0, 0.0, 0.0))
+    for look in found.looks:
+        expected = 0.0 if look.pose[0] > 10.0 else math.pi
+        assert math.cos(look.pose[2] - expected) > 0.9
 
 
 def test_known_ground_tells_against_new_ground_the_more_of_it_is_passed():

@@ -224,7 +224,8 @@ class Explorer:
         if self._route is None or not self.exploration_map.keyframe_locator.contains_route(self._route):
             return False
         if self._is_looking or self._looks_first:
-            return self._is_looking and not self._look_planner.is_outdated
+            robot = self.exploration_map.pose.pose_in_area.mean[:2]
+            return self._is_looking and self._look_planner.keeps_target(self.exploration_map.keyframe_locator, robot)
         if self._is_backtracking or self._is_ambiguous:
             return self._is_backtracking and self._is_ambiguous
         in_hallway = self._is_exploring and self._target is not None and self._target.is_in_hallway

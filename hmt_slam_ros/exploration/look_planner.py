@@ -14,18 +14,19 @@ from hmt_slam_ros.messages.ambiguity import Ambiguity
 _SAME_LOOK_DISTANCE = 1.0
 """Looks nearer to each other than this are one, m."""
 
+_KEPT_RATE = 0.5
+"""Share of the best look's information per meter from which on the robot keeps its goal: else it drives to and fro."""
+
 _NOTHING_OPEN = Ambiguity(-1, 0.0, (), "")
 
 
 class LookPlanner:
-    """Chooses looks, each place once in a task.
-
-    :ivar is_outdated: whether another ambiguity came since the last plan.
-    """
+    """Chooses looks, each place once in a task."""
 
     def __init__(self) -> None:
         self._ambiguity = self._newest = _NOTHING_OPEN
-        self.is_outdated = False
+        # Whether another ambiguity came since the target was chosen or kept.
+        self._is_outdated = False
         self._target: tuple[int, Float64] | None = None
         # Each a point (2,) in the frame of a keyframe.
         self._tried: list[tuple[int, Float64]] = []
@@ -40,7 +41,7 @@ class LookPlanner:
         :param event: the last keyframe event of the map.
         """
         if self._newest is not self._ambiguity and self._newest.sequence <= event:
-            self._ambiguity, self.is_outdated = self._newest, True
+            self._ambiguity, self._is_outdated = self._newest, True
 
     @property
     def is_open(self) -> bool:
@@ -68,7 +69,7 @@ class LookPlanner:
         :param keyframe: near the robot; points of the route are relative to it.
         :param pose: of the robot, ``area_T_base``, shape (3,).
         """
-        self.is_outdated = False
+        self._is_outdated = False
         best = self._best_look(locator)
         if best is None:
             return None
@@ -78,6 +79,29 @@ class LookPlanner:
         points = se2.transform(anchor, np.concatenate((pose[None, :2], ahead)))
         self._target = keyframe, points[-1]
         return Route((keyframe,) * len(points), points)
+
+    def keeps_target(self, locator: KeyframeLocator, robot: Float64) -> bool:
+        """Whether the look that the robot drives to still tells about as much as the best one.
+
+        :param robot: position of the robot, frame of the locator's area, shape (2,), m.
+        """
+        if not self._is_outdated:
+            return True
+        if self._target is None or self._target[0] not in locator:
+            return False
+        target = se2.transform(locator.keyframe_pose(self._target[0]), self._target[1])
+        self._is_outdated = math.dist(target, robot) >= _SAME_LOOK_DISTANCE and not self._tells(locator, target)
+        return self.is_open and not self._is_outdated
+
+    def _tells(self, locator: KeyframeLocator, place: Float64) -> bool:
+        """Whether a look at a place tells about as much per meter as the best one."""
+        best = self._best_look(locator)
+        if best is None:
+            return False
+        rate = self._ambiguity.looks[best].rate
+        positions = ((look, _position(self._ambiguity, n, locator)) for n, look in enumerate(self._ambiguity.looks))
+        beside = [look.rate for look, at in positions if at is not None and math.dist(at, place) < _SAME_LOOK_DISTANCE]
+        return max(beside, default=0.0) >= _KEPT_RATE * rate
 
     def _best_look(self, locator: KeyframeLocator) -> int | None:
         """The best look that was not tried, and whose path the map of the most probable hypothesis can place."""

@@ -1,7 +1,8 @@
 """Active disambiguation: where a look would decide between the live hypotheses, and by how much.
 
-A look is at a pose relative to the robot. Under each hypothesis the map has a scan for it, that of the nearest
-keyframe, and all hypotheses weigh this scan as TSBI does. The expected information is that of all scans on the path.
+A look is at a pose relative to the robot, in the direction in which it arrives there. Under each hypothesis the map has
+a scan for it, that of a keyframe beside it. All hypotheses weigh what of it the robot's laser would see, as TSBI does.
+The expected information is that of all scans on the path.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.registration.consistency import MAPS_OUTLIER_RATE, SCAN_IN_STORED_MAP, Agreement
 from hmt_slam_ros.registration.likelihood_grid import GridModel, surface_points
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.sensors.polar_scan import FREE, SURFACE, PolarScan, classify_points, to_polar_scan
+from hmt_slam_ros.sensors.polar_scan import FREE, SURFACE, PolarScan, classify_points, is_in_view, to_polar_scan
 
 MIN_PROBABILITY = 0.02
 """Smallest probability of a hypothesis that is weighed."""
@@ -35,6 +36,9 @@ _SPACING = 1.0
 _VIEW_RADIUS = 1.0
 """Distance of a keyframe up to which its scan is what the robot would see, m."""
 
+_VIEW_SCANS = 4
+"""Keyframes beside a look, the nearest, of which the one with the most in the robot's field of view is chosen."""
+
 _MAP_RADIUS, _MAP_SCANS = 1.5, 4
 """Distance of the keyframes from a predicted scan, m, and their number, that are the map for it."""
 
@@ -45,7 +49,7 @@ _SAME_POSE = 1e-6
 class _Place(NamedTuple):
     """Where a look is.
 
-    :ivar pose: shape (3,), ``base_T_look``, m and rad.
+    :ivar pose: shape (3,), ``base_T_look``, m and rad; it heads along the path.
     :ivar length: of the path there, m.
     :ivar previous: number of the look that the path passes last, ``NOT_DRIVEN`` for none.
     """
@@ -60,10 +64,12 @@ class _View(NamedTuple):
 
     :ivar keyframe: of the scan.
     :ivar pose: shape (3,), ``base_T_keyframe``.
+    :ivar points: shape (n, 2), surface points in the robot's field of view, frame of the keyframe, m.
     """
 
     keyframe: int
     pose: Float64
+    points: Float64
 
 
 class Disambiguation:
@@ -118,7 +124,10 @@ def _choose_places(grounds: Sequence[KnownGround]) -> list[_Place]:
         if beside is None:
             if len(places) == MAX_LOOKS:
                 break
-            places.append(_Place(at, float(length), looks[n][int(ground.previous[row])]))
+            previous = looks[n][int(ground.previous[row])]
+            before = np.zeros(2) if previous == NOT_DRIVEN else places[previous].pose[:2]
+            heading = math.atan2(at[1] - before[1], at[0] - before[0])
+            places.append(_Place(np.array((at[0], at[1], heading)), float(length), previous))
             beside = len(places) - 1
         looks[n][row] = beside
     return places
@@ -146,6 +155,7 @@ class _Information:
         self._scans, self._model, self._grounds, self._probabilities = scans, model, grounds, probabilities
         self._points: dict[int, Float64] = {}
         self._polar_scans: dict[int, PolarScan] = {}
+        self._laser = self._polar_scan(max(scans))
 
     def expected_information(self, places: Sequence[_Place]) -> list[float]:
         """The expected decrease of the entropy by the scans on the path to each place and there, nats."""
@@ -174,8 +184,8 @@ class _Information:
         """
         count = len(self._grounds)
         log_ratios = np.zeros((count, count))
-        views = [_predicted_view(ground, pose) for ground in self._grounds]
-        samples = [0 if view is None else len(self._surface_points(view.keyframe)) for view in views]
+        views = [self._predicted_view(ground, pose) for ground in self._grounds]
+        samples = [0 if view is None else len(view.points) for view in views]
         for h, view in enumerate(views):
             for j in range(count):
                 if view is None:
@@ -190,7 +200,7 @@ class _Information:
 
         What its scans do not see counts as agreement: a few scans know less than a map.
         """
-        ground, points = self._grounds[hypothesis], self._surface_points(view.keyframe)
+        ground, points = self._grounds[hypothesis], view.points
         near = ground.rows_near(view.pose[:2], _MAP_RADIUS)[:_MAP_SCANS]
         if any(
             ground.keyframes[row] == view.keyframe and np.abs(ground.poses[row] - view.pose).max() <= _SAME_POSE
@@ -206,6 +216,19 @@ class _Information:
         contradicting = int((is_free & ~on_surface).sum())
         return Agreement(len(points), len(points) - contradicting, contradicting)
 
+    def _predicted_view(self, ground: KnownGround, pose: Float64) -> _View | None:
+        """The scan of the keyframe beside a look that has the most in the robot's field of view, None on new ground.
+
+        :param pose: ``base_T_look``.
+        """
+        views = []
+        for row in ground.rows_near(pose[:2], _VIEW_RADIUS)[:_VIEW_SCANS]:
+            keyframe = int(ground.keyframes[row])
+            points = self._surface_points(keyframe)
+            in_look = se2.transform(se2.between(pose, ground.poses[row]), points)
+            views.append(_View(keyframe, ground.poses[row], points[is_in_view(self._laser, in_look)]))
+        return max(views, key=lambda view: len(view.points), default=None)
+
     def _surface_points(self, keyframe: int) -> Float64:
         if keyframe not in self._points:
             self._points[keyframe] = surface_points(self._scans[keyframe], self._model)
@@ -215,12 +238,6 @@ class _Information:
         if keyframe not in self._polar_scans:
             self._polar_scans[keyframe] = to_polar_scan(self._scans[keyframe])
         return self._polar_scans[keyframe]
-
-
-def _predicted_view(ground: KnownGround, pose: Float64) -> _View | None:
-    """The scan of the keyframe nearest to a pose, None on new ground."""
-    near = ground.rows_near(pose[:2], _VIEW_RADIUS)
-    return _View(int(ground.keyframes[near[0]]), ground.poses[near[0]]) if len(near) else None
 
 
 def _in_best_map(

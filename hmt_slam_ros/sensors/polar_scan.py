@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Float64, Int8
+from hmt_slam_ros.arrays import Bool, Float64, Int8
 from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.se2 import rotate_back, wrap_by_modulus
@@ -77,6 +77,18 @@ def classify_points(scan: PolarScan, points: Float64) -> Int8:
     return _classify_points(
         np.ascontiguousarray(points), scan.laser_pose, scan.first_angle, scan.angle_increment, scan.ranges, scan.starts
     )
+
+
+def is_in_view(scan: PolarScan, points: Float64) -> Bool:
+    """Which points are in a direction of the laser, at any range, shape (n,).
+
+    :param points: shape (n, 2), base frame of the scan, m.
+    """
+    x, y = se2.transform(se2.inverse(scan.laser_pose), points).T
+    half = 0.5 * scan.angle_increment * (scan.ranges.size - 1)
+    off = se2.wrap(np.arctan2(y, x) - scan.first_angle - half)
+    in_view: Bool = np.abs(off) <= abs(half) + 0.5 * abs(scan.angle_increment)
+    return in_view
 
 
 def occlusion_starts(scan: PolarScan, points: Float64) -> Float64:
