@@ -107,6 +107,23 @@ def test_a_laser_that_sees_half_a_circle_tells_what_is_ahead_of_the_robot_there(
     assert information_at(9.0, worlds.scan_in, back) > 0.5
 
 
+def test_where_the_robot_looked_since_nothing_new_is_to_be_seen():
+    """The first hypothesis expected a niche at x = 9 m. The robot was there, and it did not decide."""
+    replica = replica_of((LEFT, PATH), (PLAIN, PATH))
+    before = ambiguity_of(replica)
+    seen = max(replica.scans) + 1
+    replica.scans[seen] = worlds.scan_at(PLAIN, (9.0, 0.0, 0.0))
+    for h, hybrid_map in replica.maps.items():
+        hybrid_map.set_keyframe(seen, h, np.array((9.0, 0.1 * h, 0.0)))
+    after = ambiguity_of(replica)
+
+    def near(found, x):
+        return next(n for n, look in enumerate(found.looks) if abs(look.pose[0] - x) < 0.3)
+
+    assert before.looks[near(before, 9.0)].information > before.looks[near(before, 7.0)].information + 0.01
+    assert after.looks[near(after, 10.0)].information == after.looks[near(after, 7.0)].information
+
+
 def test_a_look_heads_along_its_path():
     found = ambiguity_of(replica_of((LEFT, PATH), (RIGHT, PATH)), (10.0, 0.0, 0.0))
     for look in found.looks:

@@ -42,8 +42,11 @@ _VIEW_SCANS = 4
 _MAP_RADIUS, _MAP_SCANS = 1.5, 4
 """Distance of the keyframes from a predicted scan, m, and their number, that are the map for it."""
 
+_SAME_PLACE = 0.5
+"""Difference of poses of a keyframe, from the robot, up to which hypotheses have it in the same place, m and rad."""
+
 _SAME_POSE = 1e-6
-"""Difference of poses of a keyframe up to which two hypotheses have it in the same place, m and rad."""
+"""Likewise, up to which its scan needs no comparison with itself."""
 
 
 class _Place(NamedTuple):
@@ -185,6 +188,8 @@ class _Information:
         count = len(self._grounds)
         log_ratios = np.zeros((count, count))
         views = [self._predicted_view(ground, pose) for ground in self._grounds]
+        if self._is_seen(pose, max(0 if view is None else len(view.points) for view in views)):
+            return log_ratios
         samples = [0 if view is None else len(view.points) for view in views]
         for h, view in enumerate(views):
             for j in range(count):
@@ -221,13 +226,34 @@ class _Information:
 
         :param pose: ``base_T_look``.
         """
-        views = []
-        for row in ground.rows_near(pose[:2], _VIEW_RADIUS)[:_VIEW_SCANS]:
-            keyframe = int(ground.keyframes[row])
-            points = self._surface_points(keyframe)
-            in_look = se2.transform(se2.between(pose, ground.poses[row]), points)
-            views.append(_View(keyframe, ground.poses[row], points[is_in_view(self._laser, in_look)]))
+        rows = ground.rows_near(pose[:2], _VIEW_RADIUS)[:_VIEW_SCANS]
+        views = (self._view(int(ground.keyframes[row]), ground.poses[row], pose) for row in rows)
         return max(views, key=lambda view: len(view.points), default=None)
+
+    def _is_seen(self, pose: Float64, points: int) -> bool:
+        """Whether the robot looked there before, wherever it is: all hypotheses have its keyframe at the same place.
+
+        :param pose: ``base_T_look``.
+        :param points: surface points of the predicted scans, of which the keyframe shows half at least.
+        """
+        first, *others = self._grounds
+        for row in first.rows_near(pose[:2], _VIEW_RADIUS):
+            keyframe, at = int(first.keyframes[row]), first.poses[row]
+            if all(ground.has_keyframe_at(keyframe, at, _SAME_PLACE) for ground in others):
+                view = self._view(keyframe, at, pose)
+                if 2 * len(view.points) >= points:
+                    return True
+        return False
+
+    def _view(self, keyframe: int, at: Float64, pose: Float64) -> _View:
+        """The scan of a keyframe with what of it a robot sees at a look.
+
+        :param at: ``base_T_keyframe``.
+        :param pose: ``base_T_look``.
+        """
+        points = self._surface_points(keyframe)
+        in_look = se2.transform(se2.between(pose, at), points)
+        return _View(keyframe, at, points[is_in_view(self._laser, in_look)])
 
     def _surface_points(self, keyframe: int) -> Float64:
         if keyframe not in self._points:

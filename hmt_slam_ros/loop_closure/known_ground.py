@@ -57,6 +57,16 @@ class KnownGround(NamedTuple):
         order = np.argsort(distances, kind="stable")
         return order[distances[order] <= radius]
 
+    def has_keyframe_at(self, keyframe: int, pose: Float64, tolerance: float) -> bool:
+        """Whether a keyframe is there at a pose, ``base_T_keyframe``.
+
+        :param tolerance: m and rad.
+        """
+        rows = np.flatnonzero(self.keyframes == keyframe)
+        difference = self.poses[rows] - pose
+        difference[:, 2] = se2.wrap(difference[:, 2])
+        return bool((np.abs(difference) <= tolerance).all(axis=1).any())
+
 
 def known_ground(hybrid_map: HybridMap, area: int, pose: Float64) -> KnownGround:
     """The known ground around a robot.
