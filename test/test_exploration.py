@@ -219,7 +219,7 @@ def test_a_goal_is_kept_while_a_look_there_tells_half_as_much_per_meter() -> Non
     (area, first), (other, second) = (locator.area_and_pose(keyframe) for keyframe in keyframes)
     event = atlas.event
 
-    def kept(information: float, *, remains: bool = True) -> bool:
+    def keeps(information: float, *, remains: bool = True) -> bool:
         """Whether a robot on its way to the first look keeps it for a second one of this information."""
         planner = LookPlanner()
         look = Look(area, first, 0.3, 10.0, NOT_DRIVEN)
@@ -231,10 +231,10 @@ def test_a_goal_is_kept_while_a_look_there_tells_half_as_much_per_meter() -> Non
         planner.update(event)
         return planner.keeps_target(locator, robot[:2])
 
-    assert kept(0.4)
-    assert kept(0.59)
-    assert not kept(0.61)
-    assert not kept(0.2, remains=False)
+    assert keeps(0.4)
+    assert keeps(0.59)
+    assert not keeps(0.61)
+    assert not keeps(0.2, remains=False)
 
 
 def test_an_exploration_is_interrupted_for_looks_where_that_is_wanted() -> None:

@@ -19,6 +19,7 @@ from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.team.components import Component, combine, renumber
 from hmt_slam_ros.team.join import Verdict, decide, join_at, meet
 from hmt_slam_ros.team.placement import Placement, PlacementDistribution, WindowCandidate
+from hmt_slam_ros.team.placement_evidence import PlacementEvidence
 from hmt_slam_ros.team.team_map import merge_components
 from hmt_slam_ros.team.windows import Window
 
@@ -149,7 +150,7 @@ def matched_at(shift):
     windows = [Window(area, np.zeros(3), pair.hybrid_map.keyframes(area)) for area in pair.other]
     beliefs = [PoseGaussian(np.array([x, 0.0, 0.0]), TIGHT) for x in (0.0, shift)]
     matches = {n: WindowCandidate(n, area, beliefs[n], 5.0) for n, area in enumerate(pair.known)}
-    return pair, windows, Placement(np.zeros(3), matches, 5.0, 5.0, 0.999)
+    return pair, windows, Placement(np.zeros(3), matches, PlacementEvidence(5.0, 5.0), 0.999)
 
 
 @pytest.mark.parametrize(("shift", "verdict"), [(0.02, Verdict.JOINED), (0.5, Verdict.CONTRADICTORY)])

@@ -12,12 +12,12 @@ from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.team.placement import (
-    MAX_AGREEMENT,
     PlacementGeometry,
     WindowCandidate,
     placement_distribution,
     window_candidates,
 )
+from hmt_slam_ros.team.placement_evidence import WindowEvidence, placement_evidence, similar_probability
 from hmt_slam_ros.team.windows import Window
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
 from hmt_slam_ros.topological_inference.pose_distribution import UNMAPPED_PRIOR, PoseDistribution
@@ -50,8 +50,11 @@ def match(windows, window, log_ratio, area=0, placement=TURNED, shift=(0.0, 0.0,
     return WindowCandidate(window, area, PoseGaussian(in_area + shift, TIGHT), log_ratio)
 
 
+FITS = WindowEvidence(5.0, True)
+
+
 def no_contradictions(*_):
-    return 0.0
+    return None
 
 
 def distribution(geometry, candidates, compare=no_contradictions):
@@ -71,19 +74,19 @@ def test_components_without_a_candidate_are_apart():
     assert found.best is None and found.apart == 1.0
 
 
-def test_windows_that_agree_count_up_to_a_bound_beside_the_best():
+def test_windows_that_agree_are_one_placement():
     geometry, windows = two_rows()
     found = distribution(
         geometry,
         [[match(windows, 0, 4.0, 1)], [match(windows, 1, 5.0, 2)], [match(windows, 2, 0.5, 0)]],
     )
     assert len(found.placements) == 1
-    assert found.best.best == pytest.approx(5.0)
-    # The arcs leave a share of where the third window is to other places.
-    assert MAX_AGREEMENT + 0.2 < found.best.agreement < MAX_AGREEMENT + 0.5
+    assert found.best.evidence.best == pytest.approx(5.0)
+    # The first window counts as far as similar surroundings end, and the arcs leave a share of the third elsewhere.
+    assert 1.4 < found.best.evidence.agreement < 2.1
     assert list(found.best.matches) == [1, 0, 2]
     np.testing.assert_allclose(found.best.pose, TURNED, atol=1e-9)
-    assert odds(found) == pytest.approx([found.best.best + found.best.agreement])
+    assert odds(found) == pytest.approx([sum(found.best.evidence)])
     assert sum(each.probability for each in found.placements) + found.apart == pytest.approx(1.0)
 
 
@@ -122,7 +125,8 @@ def test_a_placement_stands_out_by_what_it_agrees_more_than_false_ones():
             [],
         ],
     )
-    assert odds(found) == pytest.approx([5.0 + MAX_AGREEMENT, 4.0])
+    agreement = placement_evidence({0: FITS, 1: FITS}, similar_probability([{0: FITS}])).agreement
+    assert odds(found) == pytest.approx([5.0 + agreement, 4.0], abs=0.01)
 
 
 def test_contradictions_count_in_full():
@@ -133,7 +137,8 @@ def test_contradictions_count_in_full():
         return -7.0 if window == 2 else 0.0
 
     found = distribution(geometry, [[match(windows, 0, 5.0)], [match(windows, 1, 5.0)], []], contradict)
-    assert odds(found) == pytest.approx([5.0 + MAX_AGREEMENT - 7.0])
+    without = distribution(geometry, [[match(windows, 0, 5.0)], [match(windows, 1, 5.0)], []])
+    assert odds(found) == pytest.approx([odds(without)[0] - 7.0], abs=0.3)
 
 
 def test_windows_are_compared_where_the_placement_has_them():

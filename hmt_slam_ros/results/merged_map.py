@@ -222,8 +222,8 @@ def _placement_entry(met: PieceMeeting, placement: Placement) -> dict[str, Any]:
     return {
         **dict(zip(("x", "y", "theta"), placement.pose.tolist(), strict=True)),
         "probability": placement.probability,
-        "best_window": placement.best,
-        "other_windows": placement.agreement,
+        "best_window": placement.evidence.best,
+        "other_windows": placement.evidence.agreement,
         "agreeing": [
             {
                 "window": number,

@@ -52,8 +52,8 @@ class PlaceComparison:
         self._settings = replace(MatchSettings.from_options(options), min_log_ratio=MIN_LOG_RATIO)
         self._radius = options.place_radius
 
-    def log_ratio(self, window: int, area: int, belief: PoseGaussian, is_matched: bool) -> float:
-        """Log Bayes factor of the contradictions of a window, nats, at most 0; 0 where it lies in no place.
+    def log_ratio(self, window: int, area: int, belief: PoseGaussian, is_matched: bool) -> float | None:
+        """Log Bayes factor of the contradictions of a window, nats, at most 0; None where it lies in no place.
 
         Surfaces of either side in the free space of the other contradict. Those of a window that was matched count in
         one direction, since the match has the other one.
@@ -61,14 +61,14 @@ class PlaceComparison:
         :param area: in which ``belief`` is over ``area_T_reference``.
         """
         if float(np.linalg.eigvalsh(belief.covariance[:2, :2]).max()) > _MAX_SIGMA**2:
-            return 0.0
+            return None
         poses = self._windows[window].poses
         nearest, there = self._nearest_area(area, belief, poses)
         if nearest is None:
-            return 0.0
+            return None
         place = self._grid_cache.place(self._pair.hybrid_map, nearest, (), self._pair.first_keyframe)
         if containing_area(place, se2.compose(there.mean, stack_poses(poses)), self._radius) is None:
-            return 0.0
+            return None
         query = self._grid_cache.grid(poses)
         if is_matched:
             return min(0.0, _seen_from(query, place, there.mean))

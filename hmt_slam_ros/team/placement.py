@@ -3,11 +3,11 @@
 Each window of the second component is searched in the first with a flat prior. A candidate of it implies a placement.
 Candidates of several windows that imply the same one, as far as the arcs between them tell, are one placement H:
 
-    log P(H) = log prior + l_best + S(H) - max(0, S_2),    S(H) = sum over the other windows of min(l, log 2.5)
+    log P(H) = log prior + l_best + S(H) - max(0, S_2)
 
-with l the log Bayes factor of a window, relative to ground that the first component does not have. Similar places stay
-similar for a while, so that agreement counts in full once, and contradictions always count. Of two placements one at
-least is false: the second largest S shows how far false ones agree in this building, and is no evidence
+with l the log Bayes factor of a window, relative to ground that the first component does not have, and S(H) the
+evidence of the other windows (:mod:`hmt_slam_ros.team.placement_evidence`). Of two placements one at least is false:
+the second largest S shows how far false ones agree in this building, and is no evidence
 (docs/decisions/0070-joining-two-maps.md).
 """
 
@@ -26,6 +26,12 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
+from hmt_slam_ros.team.placement_evidence import (
+    PlacementEvidence,
+    WindowEvidence,
+    placement_evidence,
+    similar_probability,
+)
 from hmt_slam_ros.team.windows import Window
 from hmt_slam_ros.topological_inference.pose_distribution import UNMAPPED_PRIOR, PoseDistribution
 
@@ -33,9 +39,6 @@ Pose = Float64
 
 APART_PRIOR = 0.5
 """Prior probability that two components show no common ground, or none by which they could be joined."""
-
-MAX_AGREEMENT = math.log(2.5)
-"""Most that a window which agrees with a better one counts, nats (docs/decisions/0017-perceptual-aliasing.md)."""
 
 _GATE = chi_square_gate(0.999)
 """Squared Mahalanobis distance up to which candidates of two windows agree."""
@@ -71,15 +74,13 @@ class Placement:
 
     :ivar pose: shape (3,), ``first_T_second``, of the frames of the components' first areas.
     :ivar matches: {window: candidate} of those that agree, the best first.
-    :ivar best: log Bayes factor of the best window relative to unmapped ground, nats.
-    :ivar agreement: sum over the other windows, whose contradictions count in full.
+    :ivar evidence: of all windows.
     :ivar probability: of the placement.
     """
 
     pose: Pose
     matches: Mapping[int, WindowCandidate]
-    best: float
-    agreement: float
+    evidence: PlacementEvidence
     probability: float = 0.0
 
 
@@ -173,8 +174,8 @@ class PlacementGeometry:
         return se2.compose(first_T_reference, se2.inverse(second_T_reference))
 
 
-Comparison = Callable[[int, int, PoseGaussian, bool], float]
-"""Log Bayes factor, nats, at most 0, of the contradictions of a window where a placement has it.
+Comparison = Callable[[int, int, PoseGaussian, bool], float | None]
+"""Log Bayes factor, nats, at most 0, of the contradictions of a window where a placement has it; None in no place.
 
 Its arguments are the window, an area of the first component, the belief over ``area_T_reference``, and whether the
 window was matched there.
@@ -211,12 +212,14 @@ def placement_distribution(
     :param known_areas: number of areas of the first component.
     """
     possible = max(1, known_areas * len(candidates))
+    grown = _grow_placements(geometry, candidates, min(possible, _MAX_PLACEMENTS))
+    windows = [_window_evidence(geometry, each, len(candidates), compare) for each in grown]
     placements = []
-    for grown in _grow_placements(geometry, candidates, min(possible, _MAX_PLACEMENTS)):
-        log_ratios = _with_contradictions(geometry, grown, len(candidates), compare)
-        matches = {w: grown.matches[w] for w in sorted(grown.matches, key=lambda w: (-log_ratios[w], w))}
+    for n, (each, own) in enumerate(zip(grown, windows, strict=True)):
+        matches = {w: each.matches[w] for w in sorted(each.matches, key=lambda w: (-own[w].log_ratio, w))}
         pose = geometry.component_pose(*joint, next(iter(matches.values())))
-        placements.append(Placement(pose, matches, *_evidence(log_ratios)))
+        similar = similar_probability(windows[:n] + windows[n + 1 :])
+        placements.append(Placement(pose, matches, placement_evidence(own, similar)))
     return weigh_placements(placements, possible)
 
 
@@ -226,8 +229,8 @@ def weigh_placements(placements: Sequence[Placement], possible: int) -> Placemen
     :param possible: number of placements over which the prior is flat, at least those that are given.
     """
     prior = (1.0 - APART_PRIOR) / possible
-    false_agreement = sorted([0.0, 0.0, *(each.agreement for each in placements)])[-2]
-    logs = np.array([math.log(prior) + each.best + each.agreement - false_agreement for each in placements])
+    false_agreement = sorted([0.0, 0.0, *(each.evidence.agreement for each in placements)])[-2]
+    logs = np.array([math.log(prior) + sum(each.evidence) - false_agreement for each in placements])
     weights = scipy.special.softmax(np.append(logs, math.log(1.0 - prior * len(placements)))).tolist()
     weighed = [replace(each, probability=p) for each, p in zip(placements, weights[:-1], strict=True)]
     return PlacementDistribution(tuple(sorted(weighed, key=lambda each: -each.probability)), weights[-1])
@@ -287,22 +290,20 @@ def _log_mixture(log_share: float, log_ratio: float) -> float:
     return float(np.log1p(math.exp(log_share) * math.expm1(log_ratio)))
 
 
-def _with_contradictions(
+def _window_evidence(
     geometry: PlacementGeometry, grown: _Growth, windows: int, compare: Comparison
-) -> dict[int, float]:
-    """{window: log Bayes factor} under a placement, contradictions included."""
-    log_ratios = dict(grown.log_ratios)
+) -> dict[int, WindowEvidence]:
+    """{window: its evidence} under a placement, contradictions included."""
+    evidence = {}
     for window in range(windows):
-        match = grown.matches.get(window)
+        match, own = grown.matches.get(window), grown.log_ratios.get(window, 0.0)
         if match is not None:
-            log_ratios[window] += compare(window, match.area, match.belief, True)
-        elif window not in log_ratios:
+            own += compare(window, match.area, match.belief, True) or 0.0
+            evidence[window] = WindowEvidence(own, True)
+        elif window in grown.log_ratios:
+            evidence[window] = WindowEvidence(own, True)
+        else:
             predicted = geometry.predict(window, grown.matches)
-            log_ratios[window] = 0.0 if predicted is None else compare(window, *predicted, False)
-    return log_ratios
-
-
-def _evidence(log_ratios: Mapping[int, float]) -> tuple[float, float]:
-    """Log Bayes factor of the best window, and the sum of the others, of which agreement counts up to a bound."""
-    best = max(log_ratios.values())
-    return best, sum(min(each, MAX_AGREEMENT) for each in log_ratios.values()) - min(best, MAX_AGREEMENT)
+            against = None if predicted is None else compare(window, *predicted, False)
+            evidence[window] = WindowEvidence(against or 0.0, against is not None)
+    return evidence
