@@ -17,10 +17,11 @@ from benchmark.simulated.worlds import FAMILIES, World
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.evaluation import StampedPoses, read_true_poses, read_tum
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.messages.team import Verdict
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.merged_map import RobotMap, read_team
 from hmt_slam_ros.team.components import Component
-from hmt_slam_ros.team.join import Meeting, Verdict, meet
+from hmt_slam_ros.team.join import Meeting, meet
 from hmt_slam_ros.team.placement import Placement
 
 RECORDED = ("aces", "intel", "csail")

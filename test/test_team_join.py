@@ -14,10 +14,11 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import consistent_map
 from hmt_slam_ros.hybrid_map.shortest_path import map_pieces
+from hmt_slam_ros.messages.team import Verdict
 from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.team.components import Component, combine, renumber
-from hmt_slam_ros.team.join import Verdict, decide, join_at, meet
+from hmt_slam_ros.team.join import decide, join_at, meet
 from hmt_slam_ros.team.placement import Placement, PlacementDistribution, WindowCandidate
 from hmt_slam_ros.team.placement_evidence import PlacementEvidence
 from hmt_slam_ros.team.team_map import merge_components

@@ -18,6 +18,7 @@ from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import consistent_map
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
+from hmt_slam_ros.messages.team import Verdict
 from hmt_slam_ros.results.export import export_topology
 from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
 from hmt_slam_ros.results.log_reading import FIXED_PARAMETERS, map_folder
@@ -25,7 +26,6 @@ from hmt_slam_ros.results.output_folder import MERGE_REPORT, map_writer
 from hmt_slam_ros.results.recorder import keyframe_poses
 from hmt_slam_ros.results.trajectories import RelativeTrajectory, Trajectory, trajectory_in_map
 from hmt_slam_ros.team.components import Component
-from hmt_slam_ros.team.join import Verdict
 from hmt_slam_ros.team.placement import Placement
 from hmt_slam_ros.team.team_map import Piece, PieceMeeting, TeamMap, split_component
 

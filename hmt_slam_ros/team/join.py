@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_quantile
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap, apply_sigma_floor, fuse_traversals
 from hmt_slam_ros.hybrid_map.pose_graph import total_arc_chi2
 from hmt_slam_ros.loop_closure.closure_refinement import ClosureRefinement
+from hmt_slam_ros.messages.team import Verdict
 from hmt_slam_ros.team.components import Component, ComponentPair, combine
 from hmt_slam_ros.team.contradictions import PlaceComparison
 from hmt_slam_ros.team.placement import (
@@ -30,15 +30,6 @@ MIN_WINDOWS = 2
 
 _POSE_DOF = 3
 """Degrees of freedom of a pose."""
-
-
-class Verdict(StrEnum):
-    """What became of two components."""
-
-    JOINED = "joined"
-    APART = "apart"
-    OPEN = "open"
-    CONTRADICTORY = "contradictory"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,127 @@
+"""The messages between the robots of a team: what each shares of its map, and where it lies in that of another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_slam_ros.messages.map_changes import Arc
+from hmt_slam_ros.sensors import Scan
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SharedScan:
+    """The scan of a keyframe.
+
+    :ivar version: of the robot's map, at which it became part of it or changed.
+    :ivar keyframe: number of the keyframe.
+    :ivar scan: the scan.
+    """
+
+    version: int
+    keyframe: int
+    scan: Scan
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SharedArea:
+    """A definite area; without keyframes, one that was removed.
+
+    :ivar version: of the robot's map, at which it became part of it or changed.
+    :ivar area: id of the area.
+    :ivar keyframes: numbers of its n keyframes.
+    :ivar poses: shape (n, 3), ``area_T_base`` of each, m and rad.
+    :ivar arcs: to areas with smaller ids.
+    """
+
+    version: int
+    area: int
+    keyframes: tuple[int, ...]
+    poses: NDArray[np.float64]
+    arcs: tuple[Arc, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class TeamStatus:
+    """A robot -> all others: the version of the map that it shares.
+
+    :ivar robot: name of the robot.
+    :ivar session: of its map; versions of another session are not comparable.
+    :ivar version: 0 for an empty map.
+    """
+
+    robot: str
+    session: str
+    version: int
+
+
+@dataclass(frozen=True, slots=True)
+class TeamRequest:
+    """A robot -> another one: what changed since a version, please.
+
+    :ivar robot: name of the robot that wants it.
+    :ivar owner: name of the robot whose map it is.
+    :ivar session: of that map.
+    :ivar version: up to which the map is known, 0 for nothing.
+    """
+
+    robot: str
+    owner: str
+    session: str
+    version: int
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TeamUpdate:
+    """A robot -> all others: what changed in its map from a version to a later one.
+
+    :ivar robot: name of the robot.
+    :ivar session: of its map.
+    :ivar after: version before the changes.
+    :ivar version: version with them.
+    :ivar scans: by growing version.
+    :ivar areas: likewise. The scans of their keyframes are here, or in an earlier update.
+    :ivar is_complete: whether there is nothing newer.
+    """
+
+    robot: str
+    session: str
+    after: int
+    version: int
+    scans: tuple[SharedScan, ...]
+    areas: tuple[SharedArea, ...]
+    is_complete: bool
+
+
+class Verdict(StrEnum):
+    """What became of two components."""
+
+    JOINED = "joined"
+    APART = "apart"
+    OPEN = "open"
+    CONTRADICTORY = "contradictory"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TeamPlacement:
+    """team -> other programs: how the map of one robot lies in that of another, where that has changed.
+
+    :ivar robot: name of the robot that says so.
+    :ivar first: name of the robot in whose map the other's lies, ``second``.
+    :ivar verdict: joined; apart, as all placements together are less probable; open, as none is sure; or
+        contradictory, as the arcs of a sure placement contradict one another.
+    :ivar probability: of the most probable placement, 0 where there is none.
+    :ivar apart: probability that they have no common ground, or lie otherwise.
+    :ivar pose: shape (3,), ``first_T_second`` of the frames of the robots' first areas under that placement, m, rad.
+    """
+
+    robot: str
+    first: str
+    second: str
+    verdict: Verdict
+    probability: float
+    apart: float
+    pose: NDArray[np.float64]
