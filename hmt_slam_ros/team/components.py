@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,6 +43,13 @@ class Component:
         )
 
 
+class Shift(NamedTuple):
+    """What was added to the numbers of a component's areas and keyframes."""
+
+    areas: int = 0
+    keyframes: int = 0
+
+
 @dataclass(frozen=True, eq=False)
 class ComponentPair:
     """Two components as one hybrid map. The second has the larger numbers of areas and of keyframes.
@@ -67,10 +75,12 @@ class ComponentPair:
         return self.known[0], self.other[0]
 
 
-def combine(first: Component, second: Component) -> ComponentPair:
-    """Two components, each with one area or more, as one hybrid map."""
-    area_shift = first.hybrid_map.max_area_id + 1
-    keyframe_shift = max(first.scans) + 1
+def combine(first: Component, second: Component, shifts: Shift | None = None) -> ComponentPair:
+    """Two components, each with one area or more, as one hybrid map.
+
+    :param shifts: what is added to the numbers of the second; as little as possible if None.
+    """
+    area_shift, keyframe_shift = shifts or Shift(first.hybrid_map.max_area_id + 1, max(first.scans) + 1)
     shifted = renumber(second.hybrid_map, area_shift, keyframe_shift)
     areas = first.hybrid_map.area_ids()
     combined = first.hybrid_map.subgraph(areas)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,15 +16,9 @@ from hmt_slam_ros.hybrid_map.pose_graph import total_arc_chi2
 from hmt_slam_ros.loop_closure.closure_refinement import ClosureRefinement
 from hmt_slam_ros.messages.team import Verdict
 from hmt_slam_ros.team.components import Component, ComponentPair, combine
-from hmt_slam_ros.team.contradictions import PlaceComparison
-from hmt_slam_ros.team.placement import (
-    Placement,
-    PlacementDistribution,
-    PlacementGeometry,
-    placement_distribution,
-    window_candidates,
-)
-from hmt_slam_ros.team.windows import Window, WindowSearch, find_windows
+from hmt_slam_ros.team.placement import Placement, PlacementDistribution
+from hmt_slam_ros.team.placement_search import PlacementSearch
+from hmt_slam_ros.team.windows import Window
 
 MIN_WINDOWS = 2
 """Fewest windows that have to agree on a placement: one alone may be a place that looks alike."""
@@ -53,25 +48,22 @@ class Meeting:
 
 def meet(first: Component, second: Component, configuration: Configuration) -> Meeting:
     """Find how the second component lies in the first, and join them where that is sure."""
-    pair = combine(first, second)
-    windows = find_windows(pair.hybrid_map, pair.other)
-    distribution = find_placements(pair, windows, configuration)
+    pair, search = combine(first, second), PlacementSearch(configuration)
+    search.update(pair)
+    while search.step():
+        pass
+    return judge(search, configuration)
+
+
+def judge(search: PlacementSearch, configuration: Configuration) -> Meeting:
+    """What a search tells about its two components, as far as it came."""
+    pair, windows, distribution = search.pair, search.windows, search.distribution()
     verdict, joined = decide(pair, windows, distribution, configuration)
-    return Meeting(pair, tuple(windows), distribution, verdict, joined)
-
-
-def find_placements(pair: ComponentPair, windows: list[Window], configuration: Configuration) -> PlacementDistribution:
-    """The PMF over placements of the second component in the first."""
-    search = WindowSearch(pair, configuration)
-    known = len(pair.known)
-    candidates = [window_candidates(n, search.localize(window), known) for n, window in enumerate(windows)]
-    geometry = PlacementGeometry(pair.hybrid_map, windows)
-    comparison = PlaceComparison(pair, windows, geometry, configuration)
-    return placement_distribution(geometry, candidates, pair.joint, known, comparison.log_ratio)
+    return Meeting(pair, windows, distribution, verdict, joined)
 
 
 def decide(
-    pair: ComponentPair, windows: list[Window], distribution: PlacementDistribution, configuration: Configuration
+    pair: ComponentPair, windows: Sequence[Window], distribution: PlacementDistribution, configuration: Configuration
 ) -> tuple[Verdict, Component | None]:
     """What becomes of two components, and both as one where they are joined."""
     best, options = distribution.best, configuration.tlca
@@ -86,7 +78,7 @@ def decide(
 
 
 def join_at(
-    pair: ComponentPair, windows: list[Window], placement: Placement, options: LoopClosureParameters
+    pair: ComponentPair, windows: Sequence[Window], placement: Placement, options: LoopClosureParameters
 ) -> HybridMap:
     """The hybrid map with an arc for every window that agrees on a placement, fused where they join the same areas."""
     joined = pair.hybrid_map.subgraph(pair.hybrid_map.area_ids())

@@ -4,19 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.hybrid_map.shortest_path import map_pieces
-from hmt_slam_ros.team.components import Component, combine
+from hmt_slam_ros.team.components import Component, Shift, combine
 from hmt_slam_ros.team.join import Meeting, meet
-
-
-class Shift(NamedTuple):
-    """What was added to the numbers of a component's areas and keyframes."""
-
-    areas: int = 0
-    keyframes: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,22 +1,16 @@
-"""Windows: stretches of a component's path, each of which is searched in the whole of another component."""
+"""Windows: stretches of a component's path, each of which is searched in another component."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
-from hmt_slam_ros.registration.consistency import NO_CLUTTER
-from hmt_slam_ros.team.components import ComponentPair
-from hmt_slam_ros.topological_inference.event_work import EventWork
-from hmt_slam_ros.topological_inference.map_search import MapSearch
-from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
 Pose = Float64
 
@@ -50,12 +44,40 @@ class Window:
     poses: Mapping[int, Pose]
 
 
-def find_windows(hybrid_map: HybridMap, areas: Sequence[int]) -> list[Window]:
+def find_windows(hybrid_map: HybridMap, areas: Sequence[int], earlier: Sequence[Window] = ()) -> list[Window]:
     """The windows of a component in the order of its path; none overlaps another.
 
     :param areas: of the component.
+    :param earlier: windows when the component had fewer keyframes. They remain while theirs are there, but for the
+        last, which may have grown.
     """
-    keyframes = sorted((k, area) for area in areas for k in hybrid_map.keyframes(area))
+    area_of = {k: area for area in areas for k in hybrid_map.keyframes(area)}
+    windows: list[Window] = []
+    for window in earlier[:-1]:
+        if all(k in area_of for k in window.poses):
+            keyframes = [(k, area_of[k]) for k in window.poses]
+            found, count = _window_from(hybrid_map, keyframes)
+            if count == len(keyframes):
+                windows.append(found)
+    covered = {k for window in windows for k in window.poses}
+    for run in _runs(sorted(area_of), covered):
+        windows += _windows_in(hybrid_map, [(k, area_of[k]) for k in run])
+    return sorted(windows, key=lambda window: next(iter(window.poses)))
+
+
+def _runs(keyframes: Sequence[int], covered: Collection[int]) -> list[list[int]]:
+    """The stretches of keyframes between those that are covered."""
+    runs: list[list[int]] = [[]]
+    for keyframe in keyframes:
+        if keyframe not in covered:
+            runs[-1].append(keyframe)
+        elif runs[-1]:
+            runs.append([])
+    return runs
+
+
+def _windows_in(hybrid_map: HybridMap, keyframes: Sequence[tuple[int, int]]) -> list[Window]:
+    """The windows of a stretch of (keyframe, area)."""
     windows: list[Window] = []
     first = 0
     while first < len(keyframes):
@@ -83,24 +105,3 @@ def _window_from(hybrid_map: HybridMap, keyframes: Sequence[tuple[int, int]]) ->
         poses[keyframe] = pose
         last, length = pose, length + step
     return Window(area, start, poses), len(poses)
-
-
-class WindowSearch:
-    """Searches windows of one component in the whole of the other one, with a flat prior."""
-
-    def __init__(self, pair: ComponentPair, configuration: Configuration) -> None:
-        self._pair, self._work = pair, EventWork()
-        self._map_search = MapSearch(configuration, pair.scans, self._work)
-
-    def localize(self, window: Window) -> PoseDistribution:
-        """Where the window lies in the first component, or on ground that this does not have."""
-        hybrid_map, search_map = self._pair.hybrid_map, self._map_search
-        search = search_map.begin(hybrid_map, window.poses, self._pair.first_keyframe)
-        while search.unexamined:
-            self._work.begin_event()
-            search = search_map.continue_search(hybrid_map, search)
-        is_checked = False
-        while not is_checked:
-            self._work.begin_event()
-            search, is_checked = search_map.check_candidates(hybrid_map, search, NO_CLUTTER)
-        return search_map.localize(hybrid_map, search, NO_CLUTTER)

@@ -1,0 +1,122 @@
+"""The search of one component in another, while both grow: a bounded step at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.registration.consistency import NO_CLUTTER
+from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.team.components import ComponentPair
+from hmt_slam_ros.team.contradictions import PlaceComparison
+from hmt_slam_ros.team.placement import (
+    PlacementDistribution,
+    PlacementGeometry,
+    placement_distribution,
+    window_candidates,
+)
+from hmt_slam_ros.team.windows import Window, find_windows
+from hmt_slam_ros.topological_inference.event_work import EventWork
+from hmt_slam_ros.topological_inference.global_localization import GlobalSearch
+from hmt_slam_ros.topological_inference.map_search import MapSearch
+
+Keyframes = tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _WindowSearch:
+    """The search of a window.
+
+    :ivar search: of its keyframes in the first component.
+    :ivar known: {area: its keyframes} when it was searched, or is being.
+    :ivar is_checked: whether the walls of the candidates were checked.
+    """
+
+    search: GlobalSearch
+    known: Mapping[int, Keyframes]
+    is_checked: bool = False
+
+
+class PlacementSearch:
+    """Searches every window of the second component in every area of the first, each once while it stays as it is."""
+
+    def __init__(self, configuration: Configuration) -> None:
+        self._configuration = configuration
+        self._scans: dict[int, Scan] = {}
+        self._work = EventWork()
+        self._map_search = MapSearch(configuration, self._scans, self._work)
+        self._pair: ComponentPair | None = None
+        self._windows: list[Window] = []
+        self._searches: dict[Keyframes, _WindowSearch] = {}
+
+    @property
+    def pair(self) -> ComponentPair:
+        """The two components, as of the last update."""
+        assert self._pair is not None
+        return self._pair
+
+    @property
+    def windows(self) -> tuple[Window, ...]:
+        """The windows of the second component."""
+        return tuple(self._windows)
+
+    def update(self, pair: ComponentPair) -> None:
+        """Go on with components that grew or changed, with the same numbers."""
+        if any(self._scans[k] is not pair.scans.get(k) for k in self._scans):
+            self._map_search.forget_scans()
+            self._scans.clear()
+        self._scans |= pair.scans
+        self._pair = pair
+        self._windows = find_windows(pair.hybrid_map, pair.other, self._windows)
+        known = {area: tuple(pair.hybrid_map.keyframes(area)) for area in pair.known}
+        earlier = self._searches
+        self._searches = {
+            key: self._continued(pair, window, known, earlier.get(key))
+            for key, window in ((tuple(window.poses), window) for window in self._windows)
+        }
+
+    def _continued(
+        self, pair: ComponentPair, window: Window, known: Mapping[int, Keyframes], earlier: _WindowSearch | None
+    ) -> _WindowSearch:
+        """The search of a window with the areas that are new or have other keyframes still to be searched."""
+        if earlier is not None and earlier.known == known:
+            return earlier
+        search = self._map_search.begin(pair.hybrid_map, window.poses, pair.first_keyframe)
+        if earlier is None:
+            return _WindowSearch(search, known)
+        examined = {
+            area
+            for area, keyframes in known.items()
+            if earlier.known.get(area) == keyframes and area not in earlier.search.unexamined
+        }
+        unexamined = {area: p for area, p in search.unexamined.items() if area not in examined}
+        candidates = tuple(candidate for candidate in earlier.search.candidates if candidate.area in examined)
+        return _WindowSearch(replace(search, unexamined=unexamined, candidates=candidates), known)
+
+    def step(self) -> bool:
+        """Take the next step, of the work of an event; whether there was one."""
+        hybrid_map = self.pair.hybrid_map
+        for key, own in self._searches.items():
+            if own.is_checked:
+                continue
+            self._work.begin_event()
+            if own.search.unexamined:
+                self._searches[key] = replace(own, search=self._map_search.continue_search(hybrid_map, own.search))
+            else:
+                search, is_checked = self._map_search.check_candidates(hybrid_map, own.search, NO_CLUTTER)
+                self._searches[key] = replace(own, search=search, is_checked=is_checked)
+            return True
+        return False
+
+    def distribution(self) -> PlacementDistribution:
+        """The PMF over placements, as far as it was searched."""
+        pair = self.pair
+        known = len(pair.known)
+        candidates = [
+            window_candidates(n, self._map_search.localize(pair.hybrid_map, own.search, NO_CLUTTER), known)
+            for n, own in enumerate(self._searches.values())
+        ]
+        geometry = PlacementGeometry(pair.hybrid_map, self._windows)
+        comparison = PlaceComparison(pair, self._windows, geometry, self._configuration)
+        return placement_distribution(geometry, candidates, pair.joint, known, comparison.log_ratio)
