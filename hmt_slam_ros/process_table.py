@@ -178,6 +178,13 @@ RECORDER = NodeRow(
 )
 """The recorder of both runtimes. In a replay, its node runs in the OS process that started the others."""
 
+TEAM = NodeRow(
+    "team",
+    "a team of robots",
+    consumes=("Keyframe", "Hypotheses", "ClosureDecision", "TeamStatus", "TeamRequest", "TeamUpdate"),
+)
+"""The process of a robot in a team, which hears the processes of its robot and the other robots."""
+
 DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow(f"{_DOCUMENTS}:KeyframeHeader", "hmt/keyframes", "keyframe", 12),
     DocumentRow(f"{_MESSAGES}:AreaEvents", "hmt/area_events", "area_events", 4),

@@ -30,6 +30,7 @@ from hmt_slam_ros.messages.map_changes import (
     StaleBeams,
 )
 from hmt_slam_ros.messages.tasks import GoalPose, PlaceEstimate, Task, TaskResult, VelocityCommand
+from hmt_slam_ros.messages.team import TeamPlacement, TeamRequest, TeamStatus, TeamUpdate
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import Odometry, Scan
 
@@ -391,4 +392,8 @@ Message = (
     | TaskResult
     | VelocityCommand
     | PlaceEstimate
+    | TeamStatus
+    | TeamRequest
+    | TeamUpdate
+    | TeamPlacement
 )

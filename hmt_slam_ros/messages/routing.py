@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Protocol, get_args
 
 from hmt_slam_ros.messages.messages import Message
-from hmt_slam_ros.process_table import COMPANIONS, PROCESSES, RECORDER, resolve_class
+from hmt_slam_ros.process_table import COMPANIONS, PROCESSES, RECORDER, TEAM, resolve_class
 
 
 class Process(Protocol):
@@ -36,6 +36,6 @@ def message_types(names: Iterable[str]) -> tuple[type, ...]:
 
 
 SUBSCRIPTIONS: dict[str, tuple[type, ...]] = {
-    row.name: message_types(row.consumes) for row in (*PROCESSES, *COMPANIONS, RECORDER)
+    row.name: message_types(row.consumes) for row in (*PROCESSES, *COMPANIONS, RECORDER, TEAM)
 }
 """{process or node: classes of the messages that it receives}."""

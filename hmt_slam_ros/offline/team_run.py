@@ -1,0 +1,93 @@
+"""A run of several robots at once, in lock-step: each with its processes, and all with one clock and one network."""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from operator import itemgetter
+
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.logs.records import Log, LogRecord
+from hmt_slam_ros.messages.messages import Message
+from hmt_slam_ros.messages.team import TeamPlacement
+from hmt_slam_ros.offline.lock_step import LockStepRun, RunResult
+from hmt_slam_ros.process_table import TEAM
+from hmt_slam_ros.team.team import Team
+
+
+class _Radio:
+    """The process team of a robot, whose messages wait for the others."""
+
+    def __init__(self, team: Team) -> None:
+        self.team = team
+        self.sent: deque[Message] = deque()
+
+    def handle(self, message: Message) -> list[Message]:
+        """Let the process handle a message; the robot's other processes need no answer."""
+        self.sent += self.team.handle(message)
+        return []
+
+
+class TeamRun:
+    """Maps several logs at once, as if the robots had begun to drive at the same time.
+
+    :ivar runs: {robot: its run}.
+    """
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        logs: Mapping[str, Log],
+        on_placement: Callable[[float, TeamPlacement], None] | None = None,
+    ) -> None:
+        """:param logs: {name of a robot: its log}.
+
+        :param on_placement: called with the time since the start, s, and each new answer of a robot.
+        """
+        self._logs, self._on_placement = logs, on_placement
+        self._radios = {name: _Radio(Team(configuration, name, "lock-step")) for name in logs}
+        self.runs = {name: LockStepRun(configuration, observers={TEAM.name: self._radios[name]}) for name in logs}
+        self._seconds = 0.0
+
+    @property
+    def teams(self) -> dict[str, Team]:
+        """{robot: its process team}."""
+        return {name: radio.team for name, radio in self._radios.items()}
+
+    def run(self) -> dict[str, RunResult]:
+        """Map all logs to their ends, and finish the search; the result of each robot."""
+        for seconds, name, record in heapq.merge(*map(self._timed_records, self._logs), key=itemgetter(0)):
+            self._seconds = seconds
+            self.runs[name].process_record(record)
+            self._exchange()
+        results = {name: run.finish() for name, run in self.runs.items()}
+        self._exchange()
+        while any(team.is_searching for team in self.teams.values()):
+            for radio in self._radios.values():
+                radio.sent += radio.team.search(1)
+            self._exchange()
+        return results
+
+    def _timed_records(self, name: str) -> Iterator[tuple[float, str, LogRecord]]:
+        """The records of a log, each with the time since its first one, s."""
+        start = None
+        for record in self.runs[name].unread_records(self._logs[name]):
+            start = record.source_stamp if start is None else start
+            yield 1e-9 * (record.source_stamp - start), name, record
+
+    def _exchange(self) -> None:
+        """Deliver what the robots sent to all others, and what these answer."""
+        while any(radio.sent for radio in self._radios.values()):
+            for name, radio in self._radios.items():
+                if radio.sent:
+                    self._deliver(name, radio.sent.popleft())
+
+    def _deliver(self, sender: str, message: Message) -> None:
+        if isinstance(message, TeamPlacement):
+            if self._on_placement:
+                self._on_placement(self._seconds, message)
+            return
+        for name, radio in self._radios.items():
+            if name != sender:
+                radio.handle(message)

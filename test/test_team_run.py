@@ -1,0 +1,191 @@
+"""Robots that map at once and share their maps: lock-step runs of simulated drives."""
+
+from copy import deepcopy
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.messages.team import TeamPlacement, TeamRequest, TeamStatus, TeamUpdate, Verdict
+from hmt_slam_ros.offline.run import run_log
+from hmt_slam_ros.offline.team_run import TeamRun
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.team import shared_map
+from hmt_slam_ros.team import team as team_module
+from hmt_slam_ros.team.team import MAX_ROBOTS, Team
+
+CONFIGURATION = Configuration(seed=50)
+OFFICE, OTHER = "sim:office,size=0.7,seed=51", "sim:office,size=0.7,seed=50"
+
+
+def halves(world, names):
+    """{name: log} of the two laps of a drive."""
+    duration = open_log(world).duration
+    return {name: open_log(world, start=0.5 * duration * n, duration=0.5 * duration) for n, name in enumerate(names)}
+
+
+@cache
+def office_run():
+    """Two robots in one office: the run, its results and placements."""
+    placements = []
+    run = TeamRun(
+        CONFIGURATION, halves(OFFICE, ("ann", "bob")), lambda seconds, each: placements.append((seconds, each))
+    )
+    return run, run.run(), placements
+
+
+def test_two_robots_in_one_building_are_joined_while_they_drive():
+    _, results, placements = office_run()
+    duration = open_log(OFFICE).duration / 2
+    for robot in ("ann", "bob"):
+        own = [(seconds, each) for seconds, each in placements if each.robot == robot]
+        joined = next(seconds for seconds, each in own if each.verdict is Verdict.JOINED)
+        assert joined < 0.6 * duration
+        assert own[-1][1].verdict is Verdict.JOINED and own[-1][1].probability > 0.99
+    assert all(result.recorder.earlier_record is not None for result in results.values())
+
+
+def test_both_robots_find_the_same():
+    _, _, placements = office_run()
+    last = {each.robot: each for _, each in placements}
+    assert (last["ann"].first, last["ann"].second) == (last["bob"].first, last["bob"].second) == ("ann", "bob")
+    # Updates come at other times, so that numbers differ by rounding.
+    assert last["ann"].apart == pytest.approx(last["bob"].apart, rel=0.2)
+    np.testing.assert_allclose(last["ann"].pose, last["bob"].pose, atol=1e-6)
+
+
+def test_the_placement_is_that_of_the_simulation():
+    _, _, placements = office_run()
+    logs = halves(OFFICE, ("ann", "bob"))
+    starts = [
+        log.true_poses(np.array([next(r for r in log.records() if r.true_pose is not None).measurement.stamp]))[0]
+        for log in logs.values()
+    ]
+    error = se2.between(se2.between(*starts), placements[-1][1].pose)
+    # A placement is right within 1 m and 15 degrees; the arcs of both robots drift on the way to their first areas.
+    assert np.hypot(*error[:2]) < 1.0
+    assert abs(error[2]) < np.radians(3.0)
+
+
+def test_robots_of_two_buildings_stay_apart():
+    placements = []
+    logs = {"ann": halves(OFFICE, ("ann", "-"))["ann"], "bob": halves(OTHER, ("-", "bob"))["bob"]}
+    TeamRun(CONFIGURATION, logs, lambda _, each: placements.append(each)).run()
+    assert {each.verdict for each in placements} <= {Verdict.APART, Verdict.OPEN}
+
+
+def test_a_run_in_a_team_maps_as_a_run_alone_does():
+    _, results, _ = office_run()
+    alone = run_log(halves(OFFICE, ("ann", "bob"))["bob"], CONFIGURATION)
+    one, other = (each.recorder.finish(*_progress(each)) for each in (results["bob"], alone))
+    np.testing.assert_array_equal(one.trajectory, other.trajectory)
+
+
+def _progress(result):
+    progress = result.log_progress
+    return progress.stamps, progress.first_scans, progress.earlier_trajectory
+
+
+def test_three_robots_join_in_pairs():
+    placements = []
+    logs = halves(OFFICE, ("ann", "bob")) | {"cid": halves(OFFICE, ("cid", "-"))["cid"]}
+    run = TeamRun(CONFIGURATION, logs, lambda _, each: placements.append(each))
+    run.run()
+    for name, team in run.teams.items():
+        assert {other: met.verdict for other, met in team.meetings.items()} == dict.fromkeys(
+            logs.keys() - {name}, Verdict.JOINED
+        )
+
+
+class Network:
+    """Two teams whose robots have driven; messages pass as a test has it."""
+
+    def __init__(self):
+        run, _, _ = office_run()
+        self.ann = run.teams["ann"]
+        self.new = Team(CONFIGURATION, "zoe", "s")
+
+    def pass_messages(self, lost=0.0, repeated=1, seed=0):
+        """Let Ann say her status until Zoe has all, and return the number of statuses."""
+        random = np.random.default_rng(seed)
+        for count in range(1, 100):
+            waiting = [(self.new, self.ann.status)]
+            while waiting:
+                receiver, message = waiting.pop(0)
+                if random.random() < lost:
+                    continue
+                for _ in range(repeated):
+                    answers = receiver.handle(message)
+                other = self.ann if receiver is self.new else self.new
+                waiting += [(other, each) for each in answers if not isinstance(each, TeamPlacement)]
+            if not self.new.handle(self.ann.status):
+                return count
+        raise AssertionError
+
+
+def component(team, name):
+    return team._others[name].component()
+
+
+def test_a_robot_that_joins_late_gets_the_whole_map():
+    network = Network()
+    assert network.pass_messages() == 1
+    assert set(component(network.new, "ann").scans) == set(network.ann._own.component().scans)
+
+
+def test_lost_and_repeated_messages_change_nothing_in_the_end(monkeypatch):
+    monkeypatch.setattr(shared_map, "UPDATE_BYTES", 10_000)
+    network = Network()
+    assert network.pass_messages(lost=0.3, repeated=2) > 1
+    assert set(component(network.new, "ann").scans) == set(network.ann._own.component().scans)
+
+
+def test_a_robot_that_begins_anew_is_another_map():
+    network = Network()
+    network.pass_messages()
+    assert network.new.handle(TeamStatus("ann", "later", 3)) == [TeamRequest("zoe", "ann", "later", 0)]
+    assert not component(network.new, "ann").scans
+
+
+def test_a_request_for_another_robot_or_session_is_not_answered():
+    team = Team(CONFIGURATION, "ann", "s")
+    for request in (TeamRequest("zoe", "bob", "s", 0), TeamRequest("zoe", "ann", "earlier", 0)):
+        assert team.handle(request) == []
+    (update,) = team.handle(TeamRequest("zoe", "ann", "s", 0))
+    assert isinstance(update, TeamUpdate) and update.is_complete
+
+
+def test_updates_of_unknown_robots_and_the_own_status_do_nothing():
+    network, team = Network(), Team(CONFIGURATION, "bob", "s")
+    (update,) = network.ann.handle(TeamRequest("bob", "ann", network.ann.status.session, 0))
+    assert team.handle(update) == []
+    assert team.handle(team.status) == []
+    assert not team.is_searching
+
+
+def test_the_number_of_robots_is_bounded():
+    team = Team(CONFIGURATION, "ann", "s")
+    answers = [team.handle(TeamStatus(f"robot {n}", "s", 1)) for n in range(MAX_ROBOTS + 5)]
+    assert sum(map(bool, answers)) == MAX_ROBOTS
+
+
+@pytest.mark.parametrize("limit", [1, 3])
+def test_the_work_of_an_event_is_bounded(monkeypatch, limit):
+    steps = []
+    step = team_module.PlacementSearch.step
+    monkeypatch.setattr(team_module.PlacementSearch, "step", lambda search: steps.append(1) or step(search))
+    run, _, _ = office_run()
+    bob, waiting = deepcopy(run.teams["bob"]), [replace(run.teams["ann"].status, robot="abe")]
+    while waiting:
+        for request in bob.handle(waiting.pop()):
+            update = run.teams["ann"].handle(replace(request, owner="ann"))[0]
+            waiting.append(replace(update, robot="abe"))
+    assert bob.is_searching
+    bob.search(limit)
+    assert len(steps) == limit
+    while bob.is_searching:
+        bob.search(100)
+    assert bob.meetings["abe"].verdict is Verdict.JOINED
