@@ -32,15 +32,15 @@ CUTS = (1.0 / 3.0, 0.5, 2.0 / 3.0)
 """Where recorded logs are cut, as shares of their time; simulated ones are cut between their laps."""
 
 _RIGHT, _RIGHT_ANGLE = 1.0, math.radians(15.0)
-_COMMON = 2.0
-"""Distance of a keyframe to one of the other half within which they have common ground, m."""
+COMMON = 2.0
+"""Distance of positions of two drives within which they are on common ground, m."""
 
 POLICY = (
     "A log is cut in two. Each part is mapped by itself, and the second map is merged into the first one. A placement "
     f"is right if most of its windows are within {_RIGHT:g} m and {math.degrees(_RIGHT_ANGLE):.0f} degrees of the "
     "truth: the true pose of the simulation, or the run over the whole log. *Foreign* pairs are the first half of a "
     "drive and the second half of the next seed's, or of the next log: joined is wrong there. *Common* is the share of "
-    f"the second part's keyframes within {_COMMON:g} m of one of the first. Error: mean distance of windows from the "
+    f"the second part's keyframes within {COMMON:g} m of one of the first. Error: mean distance of windows from the "
     "truth."
 )
 
@@ -147,8 +147,9 @@ def _merge(settings: Settings, first: _Half, second: _Half, *, is_foreign: bool)
     one, other = (_largest(robot) for robot in robots)
     met = meet(one, other, settings.configuration)
     best = met.distribution.best
-    errors = np.full((1, 2), math.nan) if best is None or is_foreign else _window_errors(met, best, first, second)
-    is_near = (errors[:, 0] <= _RIGHT) & (errors[:, 1] <= _RIGHT_ANGLE)
+    errors = np.full((1, 2), math.nan)
+    if best is not None and not is_foreign:
+        errors = window_errors(met, best, first.truth, second.truth)
     return Merged(
         first.family,
         f"{first.name}, {second.name}" if is_foreign else first.name,
@@ -157,7 +158,7 @@ def _merge(settings: Settings, first: _Half, second: _Half, *, is_foreign: bool)
         met.verdict.value,
         0.0 if best is None else best.probability,
         met.distribution.apart,
-        bool(not is_foreign and np.mean(is_near) > 0.5),
+        are_right(errors),
         len(met.windows),
         0 if best is None else len(best.matches),
         float(np.mean(errors[:, 0])),
@@ -168,8 +169,11 @@ def _largest(robot: RobotMap) -> Component:
     return max(robot.components.values(), key=lambda component: len(component.scans))
 
 
-def _window_errors(met: Meeting, placement: Placement, first: _Half, second: _Half) -> Float64:
-    """Distance, m, and angle, rad, of every window of a placement from the truth, shape (n, 2)."""
+def window_errors(met: Meeting, placement: Placement, first: StampedPoses, second: StampedPoses) -> Float64:
+    """Distance, m, and angle, rad, of every window of a placement from the truth, shape (n, 2).
+
+    :param first: true poses of the first robot; ``second`` likewise.
+    """
     errors = []
     for number, match in placement.matches.items():
         known, area_T_known = next(iter(met.pair.hybrid_map.keyframes(match.area).items()))
@@ -180,9 +184,17 @@ def _window_errors(met: Meeting, placement: Placement, first: _Half, second: _Ha
     return np.array(errors)
 
 
-def _true_pose(met: Meeting, part: _Half, keyframe: int) -> Float64:
+def are_right(errors: Float64) -> bool:
+    """Whether most windows are where they truly are.
+
+    :param errors: those of :func:`window_errors`.
+    """
+    return bool(np.mean((errors[:, 0] <= _RIGHT) & (errors[:, 1] <= _RIGHT_ANGLE)) > 0.5)
+
+
+def _true_pose(met: Meeting, truth: StampedPoses, keyframe: int) -> Float64:
     stamps = np.array([met.pair.scans[keyframe].stamp])
-    return np.asarray(part.truth.poses[part.truth.nearest_indices(stamps)[0]], dtype=np.float64)
+    return np.asarray(truth.poses[truth.nearest_indices(stamps)[0]], dtype=np.float64)
 
 
 def _common_share(one: Component, other: Component, truth: StampedPoses) -> float:
@@ -191,8 +203,12 @@ def _common_share(one: Component, other: Component, truth: StampedPoses) -> floa
         truth.poses[truth.nearest_indices(np.array([scan.stamp for scan in part.scans.values()]))][:, :2]
         for part in (one, other)
     )
-    distances = np.hypot(*(second[:, None] - first[None]).transpose(2, 0, 1)).min(axis=1)
-    return float(np.mean(distances <= _COMMON))
+    return float(np.mean((distances_between(second, first) <= COMMON).any(axis=1)))
+
+
+def distances_between(one: Float64, other: Float64) -> Float64:
+    """Distances of positions (n, 2) from others (m, 2), shape (n, m), m."""
+    return np.asarray(np.hypot(*(one[:, None] - other[None]).transpose(2, 0, 1)))
 
 
 def merge_table(found: Sequence[Merged]) -> str:
