@@ -86,7 +86,7 @@ class PairOutcome:
 
 
 @dataclass(frozen=True)
-class _Drive:
+class _TeamDrive:
     """A drive, the shares of time at which it is cut, and the truth if it is not that of the log."""
 
     family: str
@@ -105,12 +105,12 @@ def measure_team(settings: Settings) -> Report:
         for log in logs:
             whole = settings.runner.runs([Case(log, 0, changes=settings.changes)])[0]
             truth = read_tum(whole.folder / "trajectory.tum")
-            drives += [_Drive(log.name, f"{log.name} at {cut:g}", log.path, (cut,), truth) for cut in CUTS]
+            drives += [_TeamDrive(log.name, f"{log.name} at {cut:g}", log.path, (cut,), truth) for cut in CUTS]
         for family in (name for name in names if name in FAMILIES):
             for n, seed in enumerate(seeds):
                 size, world = SIZES[n % len(SIZES)], World(family, seed)
                 cuts = tuple(k / size for k in range(1, size))
-                drives.append(_Drive(family, f"{world.name}, {size} robots", world.log, cuts, None))
+                drives.append(_TeamDrive(family, f"{world.name}, {size} robots", world.log, cuts, None))
         with ProcessPoolExecutor(settings.runner.jobs, multiprocessing.get_context("spawn")) as pool:
             found = [pair for pairs in pool.map(partial(_drive_at_once, settings.changes), drives) for pair in pairs]
     report.requirements = requirements(found)
@@ -119,7 +119,7 @@ def measure_team(settings: Settings) -> Report:
     return report
 
 
-def _drive_at_once(changes: Sequence[str], drive: _Drive) -> list[PairOutcome]:
+def _drive_at_once(changes: Sequence[str], drive: _TeamDrive) -> list[PairOutcome]:
     """Run a team over the parts of a drive."""
     configuration = load_configuration(PARAMETERS, list(changes))
     whole = open_log(drive.path)

@@ -183,7 +183,7 @@ TEAM = NodeRow(
     "a team of robots",
     consumes=("Keyframe", "Hypotheses", "ClosureDecision", "TeamStatus", "TeamRequest", "TeamUpdate"),
 )
-"""The process of a robot in a team, which hears the processes of its robot and the other robots."""
+"""The process of a robot in a team, which receives from its robot's processes and from other robots."""
 
 DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow(f"{_DOCUMENTS}:KeyframeHeader", "hmt/keyframes", "keyframe", 12),

@@ -70,6 +70,38 @@ def test_along_a_corridor_the_closure_decides_and_across_it_the_walls():
     assert found.mean[0] == pytest.approx(0.15, abs=0.05)
 
 
+NICHE = np.vstack([CORRIDOR, [[14.0, 0.0, 14.0, 2.0]]])
+"""A corridor that ends at x = 14 m, which few of the scans see."""
+
+
+def aligned_along(replaced):
+    """Position after an alignment, of which the closure has 1.3 m along the corridor; `replaced` was known before."""
+    alignment = AreaAlignment(with_changes(Configuration(), {"local_map.max_range": 5.0}))
+    known, later = worlds.drive((0.0, 1.0), (12.0, 1.0)), worlds.drive((2.0, 1.2), (11.0, 1.2))
+    loose = placed_with_error([1.3, 0.0, 0.0], np.diag([1.5**2, 0.1**2, 0.02**2]))
+    return alignment.align(place_scans(NICHE, known), place_scans(NICHE, later), loose, replaced).mean
+
+
+def test_along_a_wall_an_arc_that_was_known_holds_the_scans():
+    """The scans tell their position along the corridor to 0.16 m."""
+    tight, wide = (PoseGaussian(np.zeros(3), np.diag([sigma**2, 0.1**2, 0.02**2])) for sigma in (0.03, 0.6))
+    assert aligned_along(tight)[0] == pytest.approx(1.3, abs=0.08)
+    assert aligned_along(None)[0] == pytest.approx(0.0, abs=0.05)
+    assert aligned_along(tight)[0] > aligned_along(wide)[0] > aligned_along(None)[0]
+    # Across it, the scans decide.
+    assert aligned_along(tight)[1] == pytest.approx(0.0, abs=0.03)
+
+
+def test_directions_are_open_where_the_scans_are_not_where_the_frame_begins(alignment):
+    """A heading that is known to 2 degrees leaves a frame 10 m away open, and not the scans."""
+    heading = np.diag([0.02, 0.02, np.radians(2.0)]) ** 2
+    middle = np.array([10.0, 0.0])
+    at_frame = PoseGaussian(np.array([3.0, 1.0, 0.5]), heading)
+    assert len(alignment._open_directions(at_frame, np.zeros(2))) == 0
+    (across,) = alignment._open_directions(at_frame, middle)
+    assert abs(across @ [np.cos(0.5), np.sin(0.5)]) < 1e-6
+
+
 def test_scans_in_unknown_space_are_left_where_they_are(alignment):
     far = placed_with_error([60.0, 0.0, 0.0])
     assert alignment.align(place_scans(ROOMS, KNOWN), place_scans(ROOMS, JOINED), far) is None

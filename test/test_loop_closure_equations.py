@@ -46,7 +46,7 @@ def test_an_alignment_balances_the_points_and_the_closure():
     off = np.array([0.06, -0.05, 0.02])
     points = transform_surfels(se2.compose(off, truth), extract_surfels(scan.points, scan.origins))
     closure, matched = belief([1.5, -0.7, 0.9], 0.02 * SPREAD), belief([1.5, -0.7, 0.9], 0.5 * SPREAD)
-    found = alignment._refine_offset(points, closure, matched, view)
+    found = alignment._refine_offset(points, closure, matched, view, np.zeros((3, 3)))
     # The closure in the frame of the area in which the points lie.
     information = np.linalg.inv(closure.inverse().covariance)
     sums, gradient, _ = linearize(points, *found, view, alignment._alignment)
@@ -57,7 +57,7 @@ def test_an_alignment_balances_the_points_and_the_closure():
     assert np.abs(np.linalg.solve(temper * hessian + information, total)).max() < 1e-3
     assert 0.2 < np.linalg.norm(found) / np.linalg.norm(off) < 0.98
     tight = belief([1.5, -0.7, 0.9], 1e-4 * SPREAD)
-    np.testing.assert_array_equal(alignment._refine_offset(points, closure, tight, view), np.zeros(3))
+    np.testing.assert_array_equal(alignment._refine_offset(points, closure, tight, view, np.zeros((3, 3))), np.zeros(3))
 
 
 @pytest.mark.parametrize("shared", [(), (31,), (30, 31, 32)])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import drive, scan_in, two_rooms
+from worlds import box, drive, scan_in, two_rooms
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
@@ -156,16 +156,36 @@ def test_pairs_of_two_areas_are_limited_by_the_arcs_between_them():
 
 
 def test_directions_with_next_to_no_information_are_dropped():
+    """A turn counts as it moves a point three meters away; among positions alone, a direction needs more."""
     rng = np.random.default_rng(3)
     scale = np.diag([1.0, 1.0, 3.0])
-    for values, kept in (((5.0, 1.0, 0.021), 3), ((5.0, 1.0, 0.019), 2), ((5.0, 0.019, 0.01), 1)):
-        vectors = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        # A turn counts as it moves a point three meters away.
-        whole, part = (scale @ (vectors[:, :n] * values[:n]) @ vectors[:, :n].T @ scale for n in (3, kept))
-        (found,), (inverse,) = joint_refinement._known_directions(whole[None])
-        np.testing.assert_allclose(found, part, atol=1e-9)
-        np.testing.assert_allclose(part @ inverse @ part, part, atol=1e-9)
-        assert np.linalg.matrix_rank(inverse, tol=1e-6) == kept
+    cases = ((1.0, 0.031, 0.3, 3), (1.0, 0.029, 0.3, 2), (1.0, 0.031, 300.0, 1), (1.0, 0.5, 0.003, 2))
+    for across, along, turn, kept in cases:
+        heading = rng.uniform(-np.pi, np.pi)
+        turned = se2.transform(np.array([0.0, 0.0, heading]), np.eye(2))
+        information = np.zeros((3, 3))
+        information[:2, :2] = turned.T @ np.diag([across, along]) @ turned
+        information[2, 2] = turn
+        (found,), (inverse,) = joint_refinement._known_directions((scale @ information @ scale)[None])
+        assert np.linalg.matrix_rank(found, tol=1e-6) == np.linalg.matrix_rank(inverse, tol=1e-6) == kept
+        np.testing.assert_allclose(found @ inverse @ found, found, atol=1e-9)
+        # What is kept is as it was.
+        np.testing.assert_allclose(found, (scale @ information @ scale) @ (inverse @ found), atol=1e-9)
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.03])
+def test_noise_of_bare_walls_is_no_information_along_them(noise):
+    """Scans in a corridor whose ends are out of reach; the laser has one beam a degree."""
+    rng, corridor = np.random.default_rng(0), box(-60.0, -1.0, 60.0, 1.0)
+    poses = np.column_stack((np.linspace(-3.0, 3.0, 40), 0.2 * rng.normal(size=40), 0.1 * rng.normal(size=40)))
+    scans = [scan_in(corridor, pose, noise=noise, seed=k) for k, pose in enumerate(poses)]
+    own = extract_surfaces(scans, Configuration().local_map.max_range, OPTIONS.max_points)
+    first, second = np.array([(i, j) for i in range(40) for j in range(i + 1, 40) if poses[j, 0] - poses[i, 0] < 3.0]).T
+    relative = se2.between(poses[second], poses[first])
+    information = normal_equations(own, first, own, second, relative, 0.4, weighting_from_options(OPTIONS), 1)[0]
+    kept = [np.linalg.matrix_rank(each, tol=1e-9) for each in joint_refinement._known_directions(information)[0]]
+    assert np.mean(np.array(kept) == 3) < 0.05
+    assert np.mean(np.array(kept) == 2) > 0.9
 
 
 def test_relative_poses_are_as_certain_as_motion_and_a_share_of_what_walls_tell(surfaces):

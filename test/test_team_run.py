@@ -143,7 +143,7 @@ def test_lost_and_repeated_messages_change_nothing_in_the_end(monkeypatch):
     assert set(component(network.new, "ann").scans) == set(network.ann._own.component().scans)
 
 
-def test_a_robot_that_begins_anew_is_another_map():
+def test_another_session_of_a_robot_is_another_map():
     network = Network()
     network.pass_messages()
     assert network.new.handle(TeamStatus("ann", "later", 3)) == [TeamRequest("zoe", "ann", "later", 0)]

@@ -90,6 +90,16 @@ def _add_map_arguments(command: argparse.ArgumentParser) -> None:
         help="localization leaves the map of --from as it is, lifelong changes it only where the world has",
     )
     command.add_argument(
+        "others", type=Path, nargs="*", metavar="LOG", help="with --team: the logs of the other robots"
+    )
+    command.add_argument(
+        "--team",
+        action="store_const",
+        dest="function",
+        const="hmt_slam_ros.cli.team_commands:run_team",
+        help="map several logs at once, each as a robot with an unknown start, and join what shows the same ground",
+    )
+    command.add_argument(
         "--jobs",
         type=_count,
         default=len(os.sched_getaffinity(0)),

@@ -20,6 +20,7 @@ from hmt_slam_ros.cli.terminal import Progress, report_left_out, summary
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
+from hmt_slam_ros.offline.lock_step import RunResult
 from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.process_memory import resource_usage
@@ -39,6 +40,8 @@ from hmt_slam_ros.saved_map.folder import HMT_MAP
 
 def run_map(options: argparse.Namespace) -> None:
     """Map the log, write the output folder and print a summary."""
+    if options.others:
+        raise HmtSlamError(f"map takes one log, and {1 + len(options.others)} are given: give one, or --team")
     configuration, state, log = _initial_state(options)
     report_left_out(log, options.command)
     log_seconds = log.duration
@@ -59,24 +62,24 @@ def _initial_state(options: argparse.Namespace) -> tuple[Configuration, RunState
         configuration = chosen_configuration(options)
         if configuration.mode == "localization":
             raise HmtSlamError("mode = localization wants a map to find the robot in: give --from, or map first")
-        return configuration, RunState(), _open_time_window(options.log, configuration)
+        return configuration, RunState(), open_time_window(options.log, configuration)
     folder = map_folder(options.source)
     state, saved = read_run_state(folder)
     whole = with_changes(saved, {"robot.duration": 0.0})
     configuration = chosen_configuration(options, whole)
-    log = _open_time_window(options.log, configuration)
+    log = open_time_window(options.log, configuration)
     further = not is_newest_log(state.log, log)
     if further:
         state = replace(state, log=replace(state.log, earlier_trajectory=read_saved_map(folder).relative_trajectory))
         configuration = chosen_configuration(options, with_changes(whole, {"robot.start": 0.0}))
-        log = _open_time_window(options.log, configuration)
+        log = open_time_window(options.log, configuration)
     changes = describe_parameter_changes(saved, configuration, further=further)
     for sentence in filter(None, (describe_log(state.log, log.name, further=further), changes)):
         print(f"hmt_slam map: {sentence}", file=sys.stderr)
     return configuration, state, log
 
 
-def _open_time_window(path: Path, configuration: Configuration) -> Log:
+def open_time_window(path: Path, configuration: Configuration) -> Log:
     """The part of a log that ``robot.start`` and ``robot.duration`` select."""
     log = open_log(path, start=configuration.robot.start, duration=configuration.robot.duration or None)
     if not log.scan_count:
@@ -103,6 +106,17 @@ def run_measured(
     gc.freeze()
     with Progress(log.scan_count, log.duration) as progress:
         result = run_log(log, configuration, progress, state=state, on_state=on_state, compact_record=True, jobs=jobs)
+    return finish_measured(log, result, configuration, wall, cpu)
+
+
+def finish_measured(
+    log: Log, result: RunResult, configuration: Configuration, wall: float, cpu: float
+) -> tuple[FinalMap, NDArray[np.int64], RunMetrics]:
+    """The final map of a run and its figures, as :func:`run_measured` has them.
+
+    :param wall: monotonic time at the begin of the run, s.
+    :param cpu: time of the process then, s.
+    """
     begin = time.process_time()
     recording = result.recorder.finish(
         result.log_progress.stamps, result.log_progress.first_scans, result.log_progress.earlier_trajectory

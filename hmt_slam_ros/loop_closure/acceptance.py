@@ -12,7 +12,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, match_moments
+from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, fuse, match_moments
 from hmt_slam_ros.grids.patches import GridView
 from hmt_slam_ros.hybrid_map.hybrid_map import (
     ArcValue,
@@ -39,12 +39,18 @@ KeyframeScans: TypeAlias = Mapping[int, Scan]
 ArcKeyframes: TypeAlias = dict[AreaPair, frozenset[int]]
 
 
+_HELD_INFORMATION = 1e8
+"""Information along a direction that is held, 1 / m^2: a tenth of a millimeter."""
+
+
 class AreaAlignment:
     """Aligns several scans as one rigid body with several others.
 
     First a global search covers all poses that the closure's covariance admits, since a local one would end at the next
     similar structure. From its best pose, Gauss-Newton steps on the distance field of the map with Cauchy weights go
-    below the width of the search's cells.
+    below the width of the search's cells. Along a direction in which the search finds no position to a cell, its mean
+    counts as it compares with the belief by which the scans were placed. There the steps would follow the noise of the
+    normals, and are left out (solution remapping, Zhang et al. 2016; docs/decisions/0072-open-directions.md).
     """
 
     def __init__(self, configuration: Configuration) -> None:
@@ -56,19 +62,28 @@ class AreaAlignment:
         self._gate = chi_square_gate(configuration.tsbi.gate_probability)
 
     def align(
-        self, known: Sequence[PlacedScan], joined: Sequence[PlacedScan], closure: PoseGaussian
+        self,
+        known: Sequence[PlacedScan],
+        joined: Sequence[PlacedScan],
+        closure: PoseGaussian,
+        replaced: PoseGaussian | None = None,
     ) -> PoseGaussian | None:
-        """The belief over ``known_T_joined`` by the scans alone, as the moments of all modes.
+        """The belief over ``known_T_joined`` by the scans, as the moments of all modes.
 
         :param known: (scan, ``known_T_base``) of the keyframes that the area held before.
         :param joined: (scan, ``joined_T_base``) of those that joined it.
         :param closure: belief over ``known_T_joined`` by TSBI, which also matched the surroundings.
+        :param replaced: the same of before, None for a new loop.
         :returns: None if the scans determine the pose no better than the closure did.
         """
         modes = match_areas(self._build_grid(joined), self._build_grid(known), closure, self._settings).modes
         matched = match_moments([(mode.measured, mode.log_mass) for mode in modes]) if modes else closure
         if np.linalg.det(matched.covariance) >= np.linalg.det(closure.covariance):
             return None
+        placed = closure if replaced is None else fuse([PoseGaussian(closure.mean, replaced.covariance), closure])
+        middle = np.mean([pose[:2] for _, pose in joined], axis=0)
+        open_directions = self._open_directions(matched, middle)
+        matched = _weigh_position(matched, PoseGaussian(closure.mean, placed.covariance), middle, open_directions)
         table = self._mapping.pool.empty_table()
         for scan, pose in known:
             self._mapping.insert_scan(table[None], pose[None], scan)
@@ -76,7 +91,10 @@ class AreaAlignment:
             transform_surfels(se2.compose(matched.mean, pose), self._mapping.matching_surfels(scan))
             for scan, pose in joined
         ]
-        offset = self._refine_offset(np.concatenate(surfels), closure, matched, self._mapping.pool.view(table))
+        view, place = self._mapping.pool.view(table), se2.transform(matched.mean, middle[None])[0]
+        offset = self._refine_offset(
+            np.concatenate(surfels), closure, matched, view, _held_information(open_directions, place)
+        )
         self._mapping.pool.release(table)
         covariance = min(self._inflation * matched.covariance, closure.covariance, key=np.linalg.det)
         return PoseGaussian(se2.compose(offset, matched.mean), covariance)
@@ -85,18 +103,60 @@ class AreaAlignment:
         poses = np.array([pose for _, pose in scans]).reshape(-1, 3)
         return build_area_grid([scan for scan, _ in scans], poses, self._model)
 
-    def _refine_offset(self, points: Float64, closure: PoseGaussian, matched: PoseGaussian, view: GridView) -> Float64:
+    def _open_directions(self, matched: PoseGaussian, middle: Float64) -> Float64:
+        """Unit vectors, shape (k, 2), known area's frame, along which a match leaves the middle of the scans open.
+
+        :param middle: in the frame of the scans, shape (2,), m.
+        """
+        at_middle = matched.compose(PoseGaussian.from_pose(np.array([*middle, 0.0])))
+        values, vectors = np.linalg.eigh(at_middle.covariance[:2, :2])
+        heading = np.array([0.0, 0.0, at_middle.mean[2]])
+        return se2.transform(heading, vectors.T[values > self._model.cell**2])
+
+    def _refine_offset(
+        self, points: Float64, closure: PoseGaussian, matched: PoseGaussian, view: GridView, held: Float64
+    ) -> Float64:
         """The motion in the area's frame, shape (3,), that improves the match, or none if it leaves its gate.
 
-        The closure holds the directions that walls leave open.
+        :param held: information (3, 3) by which open directions are held; the closure holds what walls show little of.
         """
         closure_information, matched_information = (
             np.linalg.inv(belief.inverse().covariance) for belief in (closure, matched)
         )
         no_motion = np.zeros(3)
-        prior = scan_to_map.Prior(no_motion, closure_information.astype(np.float64, copy=False))
+        prior = scan_to_map.Prior(no_motion, (closure_information + held).astype(np.float64, copy=False))
         offset, _ = scan_to_map.align(points, no_motion, prior, view, self._alignment)
         return offset if offset @ matched_information @ offset <= self._gate else no_motion
+
+
+def _weigh_position(matched: PoseGaussian, placed: PoseGaussian, middle: Float64, directions: Float64) -> PoseGaussian:
+    """A match whose middle is between its own place and that before, by their variances, along some directions.
+
+    :param directions: unit vectors, shape (k, 2).
+    """
+    at_middle = PoseGaussian.from_pose(np.array([*middle, 0.0]))
+    before, after = placed.compose(at_middle), matched.compose(at_middle)
+    mean = matched.mean.copy()
+    for direction in directions:
+        variances = [_variance_along(direction, belief) for belief in (before, after)]
+        off = float(direction @ (before.mean - after.mean)[:2])
+        mean[:2] += direction * off * variances[1] / (variances[0] + variances[1])
+    return PoseGaussian(mean, matched.covariance)
+
+
+def _variance_along(direction: Float64, belief: PoseGaussian) -> float:
+    """Variance of a position along a unit vector (2,), m^2."""
+    own = se2.transform(np.array([0.0, 0.0, -belief.mean[2]]), direction[None])[0]
+    return float(own @ belief.covariance[:2, :2] @ own)
+
+
+def _held_information(directions: Float64, place: Float64) -> Float64:
+    """The information of a motion, shape (3, 3), that holds a place along unit vectors (k, 2).
+
+    :param place: shape (2,), m.
+    """
+    rows = np.column_stack((directions, directions @ np.array([-place[1], place[0]])))
+    return _HELD_INFORMATION * rows.T @ rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +209,12 @@ def pending_arc(arc: Arc, hypothesis: Hypothesis, event: int, near: int, hybrid_
     replaced = None if value is None or before is None else Arc(source, target, before, value.closure)
     joined = tuple(sorted(moved.keyframe for moved in hypothesis.moved_keyframes if moved.area == target))
     return PendingArc(event, near, source, target, pose, arc.closure, replaced, joined, frozenset(joined or [event]))
+
+
+def _replaced_pose(pending: PendingArc) -> PoseGaussian | None:
+    """The belief of the arc that one replaces, None where that one was uninformative."""
+    replaced = pending.replaced_arc
+    return None if replaced is None or is_uninformative(replaced.pose) else replaced.pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,6 +316,7 @@ class Acceptance:
             [(scans[keyframe], poses[keyframe]) for keyframe in known],
             [(scans[keyframe], poses[keyframe]) for keyframe in joined],
             PoseGaussian(np.zeros(3), pending.pose.covariance),
+            _replaced_pose(pending),
         )
         if motion is None:
             return pending, []
@@ -267,7 +334,7 @@ class Acceptance:
             [(scans[keyframe], pose) for keyframe, pose in hybrid_map.keyframes(area).items()]
             for area in (pending.source, pending.target)
         )
-        aligned = self._alignment.align(source_scans, target_scans, pending.pose)
+        aligned = self._alignment.align(source_scans, target_scans, pending.pose, _replaced_pose(pending))
         return pending if aligned is None else replace(pending, pose=aligned)
 
     def _fuse_arc(self, pending: PendingArc, old: Arc | None, observers: frozenset[int]) -> Arc:

@@ -57,6 +57,11 @@ _SCALE = np.array([1.0, 1.0, 1.0 / 3.0])
 _MIN_INFORMATION_SHARE = 0.004
 """Smallest information along a direction relative to the largest: normals are off by some hundredths."""
 
+_MIN_POSITION_SHARE = 0.03
+"""The same among positions alone: of pairs of scans of bare walls, 181 beams with 3 cm of noise, 95 % have less.
+
+From docs/decisions/0072-open-directions.md.
+"""
 
 _GATE = chi_square_gate(0.999)
 """Squared Mahalanobis distance up to which a registration is what the arcs admit, and a motion what odometry does."""
@@ -322,11 +327,22 @@ def _invert(matrices: Float64) -> Float64:
     return np.linalg.inv(matrices).astype(np.float64, copy=False)
 
 
+def _without_open_position(information: Float64) -> Float64:
+    """Information (m, 3, 3) without the position along which there is next to none compared with that across it."""
+    values, vectors = np.linalg.eigh(information[:, :2, :2])
+    is_open = values[:, 0] <= _MIN_POSITION_SHARE * values[:, 1]
+    along = np.zeros((len(information), 3))
+    along[:, :2] = np.where(is_open[:, None], vectors[:, :, 0], 0.0)
+    across = np.eye(3) - np.einsum("mi,mj->mij", along, along)
+    return across @ information @ across
+
+
 def _known_directions(information: Float64) -> tuple[Float64, Float64]:
     """Information (m, 3, 3) without directions along which there is next to none, and its pseudo-inverse (m, 3, 3).
 
     Noise of the normals gives each pair a little information along every direction. Over many pairs it would add up.
     """
+    information = _without_open_position(information)
     scale = np.outer(_SCALE, _SCALE)
     values, vectors = np.linalg.eigh(information * scale)
     known = values > _MIN_INFORMATION_SHARE * values[:, -1:]

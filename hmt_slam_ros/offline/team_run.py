@@ -13,6 +13,7 @@ from hmt_slam_ros.messages.messages import Message
 from hmt_slam_ros.messages.team import TeamPlacement
 from hmt_slam_ros.offline.lock_step import LockStepRun, RunResult
 from hmt_slam_ros.process_table import TEAM
+from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.team.team import Team
 
 
@@ -55,12 +56,18 @@ class TeamRun:
         """{robot: its process team}."""
         return {name: radio.team for name, radio in self._radios.items()}
 
-    def run(self) -> dict[str, RunResult]:
-        """Map all logs to their ends, and finish the search; the result of each robot."""
+    def run(self, on_state: Callable[[str, RunState], None] | None = None) -> dict[str, RunResult]:
+        """Map all logs to their ends, and finish the search; the result of each robot.
+
+        :param on_state: called with each robot and its state after its last record, before ``EndOfLog``.
+        """
         for seconds, name, record in heapq.merge(*map(self._timed_records, self._logs), key=itemgetter(0)):
             self._seconds = seconds
             self.runs[name].process_record(record)
             self._exchange()
+        if on_state:
+            for name, run in self.runs.items():
+                on_state(name, run.state)
         results = {name: run.finish() for name, run in self.runs.items()}
         self._exchange()
         while any(team.is_searching for team in self.teams.values()):

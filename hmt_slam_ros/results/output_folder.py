@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import platform
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -59,6 +60,9 @@ OUTPUT_FILES = frozenset(
     }
 )
 """All files of output folders; beside them are :data:`STAGES`, :data:`EARLIER_LOGS` and the map."""
+
+_ROBOT = re.compile(r"robot_\d{1,3}")
+"""Names of the output folders of robots in that of their team: those of :func:`robot_folder`."""
 
 _STAGE_FILES = frozenset({"filter.tum", "arcs.tum", "keyframes.tum"})
 """All files in :data:`STAGES`."""
@@ -124,6 +128,14 @@ def atomic_output(directory: Path) -> Iterator[Path]:
         scratch.remove()
 
 
+def robot_folder(number: int) -> str:
+    """Name of the output folder of a robot in that of its team.
+
+    :param number: from 1 on.
+    """
+    return f"robot_{number}"
+
+
 def check_replaceable(directory: Path) -> None:
     """Check that writing to a path loses no data.
 
@@ -157,6 +169,8 @@ def _foreign_part(entry: Path) -> Path | None:
         return None if own else entry
     if entry.name == HMT_MAP:
         return foreign_entry(entry, FORMAT)
+    if entry.is_dir() and _ROBOT.fullmatch(entry.name):
+        return _foreign_entry(entry)
     if not entry.is_dir() or entry.name not in (STAGES, EARLIER_LOGS):
         return entry
     return next((file for file in sorted(entry.iterdir()) if not _is_trajectory(file)), None)

@@ -72,11 +72,11 @@ class PlacementSearch:
         known = {area: tuple(pair.hybrid_map.keyframes(area)) for area in pair.known}
         earlier = self._searches
         self._searches = {
-            key: self._continued(pair, window, known, earlier.get(key))
+            key: self._continue_search(pair, window, known, earlier.get(key))
             for key, window in ((tuple(window.poses), window) for window in self._windows)
         }
 
-    def _continued(
+    def _continue_search(
         self, pair: ComponentPair, window: Window, known: Mapping[int, Keyframes], earlier: _WindowSearch | None
     ) -> _WindowSearch:
         """The search of a window with the areas that are new or have other keyframes still to be searched."""

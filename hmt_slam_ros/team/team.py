@@ -23,11 +23,11 @@ _STEPS = 8
 """Steps of the search after a keyframe event, of 30 ms each: they bound its work."""
 
 
-class _Pair:
+class _PairState:
     """The robot's map and that of another one.
 
     :ivar is_outdated: whether one of them changed since the search began or went on.
-    :ivar meeting: what the search told at its end, None before.
+    :ivar meeting: what the search found at its end, None before.
     """
 
     def __init__(self, configuration: Configuration) -> None:
@@ -55,7 +55,7 @@ class Team:
         # The own map as the others see it.
         self._own = ForeignMap(session)
         self._others: dict[str, ForeignMap] = {}
-        self._pairs: dict[str, _Pair] = {}
+        self._pairs: dict[str, _PairState] = {}
 
     @property
     def status(self) -> TeamStatus:
@@ -100,7 +100,7 @@ class Team:
         if name == self._robot or (name not in self._others and len(self._others) == MAX_ROBOTS):
             return []
         if name not in self._others or self._others[name].session != status.session:
-            self._others[name], self._pairs[name] = ForeignMap(status.session), _Pair(self._configuration)
+            self._others[name], self._pairs[name] = ForeignMap(status.session), _PairState(self._configuration)
         known = self._others[name]
         if status.version <= known.version:
             return []
@@ -132,7 +132,7 @@ class Team:
         """Whether there is something left to search."""
         return any(pair.is_outdated or not pair.is_judged for pair in self._pairs.values())
 
-    def _update(self, name: str, pair: _Pair) -> None:
+    def _update(self, name: str, pair: _PairState) -> None:
         """Let the search of a pair go on with the maps of now, if both have areas."""
         pair.is_outdated = False
         own, other = self._own.component(), self._others[name].component()
@@ -141,7 +141,7 @@ class Team:
             pair.search.update(combine(first, second, _SHIFT))
             pair.is_judged = False
 
-    def _judge(self, name: str, pair: _Pair) -> list[Message]:
+    def _judge(self, name: str, pair: _PairState) -> list[Message]:
         """The answer at the end of a search, where it differs from the one before."""
         before, pair.meeting, pair.is_judged = pair.meeting, judge(pair.search, self._configuration), True
         first, second = sorted((self._robot, name))

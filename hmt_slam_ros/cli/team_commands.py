@@ -1,0 +1,62 @@
+"""The command ``map --team``: maps several logs at once, and joins the maps."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+from hmt_slam_ros.cli.arguments import chosen_configuration
+from hmt_slam_ros.cli.run_commands import finish_measured, open_time_window
+from hmt_slam_ros.cli.terminal import report_left_out, summary
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.messages.team import TeamPlacement
+from hmt_slam_ros.offline.team_run import TeamRun
+from hmt_slam_ros.results.merged_map import describe_meeting, read_team, write_merged
+from hmt_slam_ros.results.output_folder import atomic_output, map_writer, robot_folder, write_output
+from hmt_slam_ros.team.team_map import merge_components
+
+
+def run_team(options: argparse.Namespace) -> None:
+    """Map the logs at once; write the map of the team, and a folder for each robot in it."""
+    configuration, paths = _checked_configuration(options), [options.log, *options.others]
+    logs = {robot_folder(n): open_time_window(path, configuration) for n, path in enumerate(paths, 1)}
+    for log in logs.values():
+        report_left_out(log, options.command)
+    wall, cpu = time.monotonic(), time.process_time()
+    with atomic_output(options.out) as folder:
+        writers = {}
+        for name in logs:
+            (folder / name).mkdir()
+            writers[name] = map_writer(folder / name)
+        results = TeamRun(configuration, logs, _report).run(lambda name, state: writers[name].write_state(state))
+        for name, log in logs.items():
+            final, stamps, figures = finish_measured(log, results[name], configuration, wall, cpu)
+            write_output(folder / name, final, stamps, figures, configuration, writers[name])
+            print(summary(options.out / name, final.recording, log.duration, figures.wall_seconds))
+        robots = read_team([folder / name for name in logs])
+        components = {name: component for robot in robots for name, component in robot.components.items()}
+        team = merge_components(components, configuration)
+        write_merged(folder, robots, team, configuration)
+    print(*map(describe_meeting, team.meetings), sep="\n")
+
+
+def _checked_configuration(options: argparse.Namespace) -> Configuration:
+    """The configuration of a team.
+
+    :raises HmtSlamError: where it is none.
+    """
+    if not options.others:
+        raise HmtSlamError("--team maps several logs at once, and one is given: name another one")
+    if options.source is not None or options.mode is not None:
+        raise HmtSlamError("--team maps from scratch: leave out --from and --mode")
+    return chosen_configuration(options)
+
+
+def _report(seconds: float, placement: TeamPlacement) -> None:
+    """Say what is new on two robots, once."""
+    if placement.robot == placement.first:
+        names = f"{placement.second} in the map of {placement.first}"
+        sure = f"{placement.verdict.value}, probability {placement.probability:.3f}, apart {placement.apart:.3f}"
+        print(f"hmt_slam map: {seconds:.0f} s: {names}: {sure}", file=sys.stderr)

@@ -1,0 +1,48 @@
+"""The command ``map --team``."""
+
+import json
+import re
+
+import pytest
+
+from hmt_slam_ros.cli.main import main
+
+FIRST = "sim:office,size=0.7,seed=51,laps=1"
+SECOND = "sim:office,size=0.7,seed=51,laps=1,visit=1"
+
+
+def run_map(*arguments):
+    return main(["map", *map(str, arguments)])
+
+
+def test_robots_of_one_building_have_one_map_and_each_its_own(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run_map(FIRST, SECOND, "--team", "--seed", "50", "--out", out) == 0
+    printed = capsys.readouterr()
+    assert re.search(r"robot_2 in the map of robot_1: joined, probability 0\.99\d", printed.err)
+    assert re.search(r"robot_2 joins robot_1 with probability \d\.\d{3}, by \d+ places", printed.out)
+    report = json.loads((out / "merge.json").read_text())
+    assert [len(piece["components"]) for piece in report["pieces"]] == [2]
+    for robot in ("robot_1", "robot_2"):
+        assert {"hmt_map", "map.png", "report.json", "trajectory.tum"} <= {
+            each.name for each in (out / robot).iterdir()
+        }
+        assert main(["plot", str(out / robot)]) == 0
+    assert {"hmt_map", "map.png", "topology.graphml"} <= {each.name for each in out.iterdir()}
+    # An old result is replaced.
+    assert run_map(FIRST, SECOND, "--team", "--duration", "20", "--out", out) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ((FIRST, "--team"), "--team maps several logs at once, and one is given: name another one"),
+        ((FIRST, SECOND), "map takes one log, and 2 are given: give one, or --team"),
+        ((FIRST, SECOND, "--team", "--mode", "lifelong"), "--team maps from scratch: leave out --from and --mode"),
+        ((FIRST, FIRST, "--team", "--duration", "20"), "all scans of robot_2 are in robot_1, too: leave it out"),
+    ],
+)
+def test_faults_are_named(arguments, complaint, tmp_path, capsys):
+    assert run_map(*arguments, "--out", tmp_path / "out") == 2
+    assert complaint in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
