@@ -17,7 +17,7 @@ def run_map(*arguments):
 
 def test_robots_of_one_building_have_one_map_and_each_its_own(tmp_path, capsys):
     out = tmp_path / "out"
-    assert run_map(FIRST, SECOND, "--team", "--seed", "50", "--out", out) == 0
+    assert run_map(FIRST, SECOND, "--team", "--seed", "50", "--duration", "85", "--out", out) == 0
     printed = capsys.readouterr()
     assert re.search(r"robot_2 in the map of robot_1: joined, probability 0\.99\d", printed.err)
     assert re.search(r"robot_2 joins robot_1 with probability \d\.\d{3}, by \d+ places", printed.out)
@@ -30,7 +30,7 @@ def test_robots_of_one_building_have_one_map_and_each_its_own(tmp_path, capsys):
         assert main(["plot", str(out / robot)]) == 0
     assert {"hmt_map", "map.png", "topology.graphml"} <= {each.name for each in out.iterdir()}
     # An old result is replaced.
-    assert run_map(FIRST, SECOND, "--team", "--duration", "20", "--out", out) == 0
+    assert run_map(FIRST, SECOND, "--team", "--duration", "10", "--out", out) == 0
 
 
 @pytest.mark.parametrize(

@@ -21,10 +21,10 @@ CONFIGURATION = Configuration(seed=50)
 OFFICE, OTHER = "sim:office,size=0.7,seed=51", "sim:office,size=0.7,seed=50"
 
 
-def halves(world, names):
-    """{name: log} of the two laps of a drive."""
-    duration = open_log(world).duration
-    return {name: open_log(world, start=0.5 * duration * n, duration=0.5 * duration) for n, name in enumerate(names)}
+def halves(world, names, share=1.0):
+    """{name: log} of the two laps of a drive, or of a share of each."""
+    lap = 0.5 * open_log(world).duration
+    return {name: open_log(world, start=lap * n, duration=share * lap) for n, name in enumerate(names)}
 
 
 @cache
@@ -91,7 +91,7 @@ def _progress(result):
 
 def test_three_robots_join_in_pairs():
     placements = []
-    logs = halves(OFFICE, ("ann", "bob")) | {"cid": halves(OFFICE, ("cid", "-"))["cid"]}
+    logs = halves(OFFICE, ("ann", "bob"), 0.7) | {"cid": halves(OFFICE, ("cid", "-"), 0.7)["cid"]}
     run = TeamRun(CONFIGURATION, logs, lambda _, each: placements.append(each))
     run.run()
     for name, team in run.teams.items():
