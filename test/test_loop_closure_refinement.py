@@ -25,7 +25,7 @@ CLOSURE = np.diag([0.2**2, 0.2**2, 0.05**2])
 TRAVELLED = np.diag([0.03**2, 0.03**2, 0.01**2])
 
 
-def make_areas(bend=0.0, seed=0):
+def make_areas(bend=0.0, seed=0, closure=CLOSURE):
     """Areas in frames at their first keyframes; the closing arc is off by ERROR, area 2 is bent, rad a keyframe."""
     hybrid_map, scans, truth, k = HybridMap(), {}, {}, 0
     for area, poses in VISITS.items():
@@ -37,7 +37,7 @@ def make_areas(bend=0.0, seed=0):
     first = {area: poses[0] for area, poses in VISITS.items()}
     hybrid_map.set_arc(0, 1, PoseGaussian(se2.between(first[0], first[1]), TRAVELLED), closure=False)
     off = se2.compose(se2.between(first[0], first[2]), se2.exp(ERROR))
-    hybrid_map.set_arc(0, 2, PoseGaussian(off, CLOSURE), closure=True)
+    hybrid_map.set_arc(0, 2, PoseGaussian(off, closure), closure=True)
     return hybrid_map, scans, truth
 
 
@@ -105,6 +105,15 @@ def test_the_closing_arc_is_far_more_certain_and_not_too_much_so_and_one_to_an_a
         assert np.sqrt(np.trace(arc.covariance[:2, :2])) < 0.1
     # Rooms are clearer than buildings with drift, for which the covariance is made.
     assert np.mean(squared) < 3.0
+
+
+@pytest.mark.parametrize(("before", "is_kept"), [(0.3, False), (0.5, True), (2.0, True)])
+def test_a_position_that_was_known_no_better_than_the_refinement_captures_stays_as_uncertain(before, is_kept):
+    """It may have ended at another structure that looks alike."""
+    hybrid_map, scans, _ = make_areas(closure=np.diag([before**2, 0.2**2, 0.05**2]))
+    deviations = np.sqrt(np.diag(refine(hybrid_map, scans).arcs[0, 2].covariance))
+    assert deviations[0] == pytest.approx(before, rel=0.05) if is_kept else deviations[0] < 0.1
+    assert deviations[1] < 0.1
 
 
 def test_along_a_bare_corridor_the_closing_arc_stays_uncertain():

@@ -65,6 +65,8 @@ class ClosureRefinement:
         self._options = configuration.refinement
         self._motion = configuration.motion
         self._max_range = configuration.local_map.max_range
+        # The refinement pairs surfaces that are this near to each other at its start, m.
+        self._capture = configuration.refinement.first_gate
 
     def refine(self, hybrid_map: HybridMap, scans: Mapping[int, Scan], closed_areas: Collection[int]) -> RefinedClosure:
         """The refined surroundings of closures.
@@ -118,7 +120,8 @@ class ClosureRefinement:
             a_T_first = PoseGaussian.from_pose(refined.keyframes[a][origins[a]])
             second_T_b = PoseGaussian.from_pose(se2.inverse(refined.keyframes[b][origins[b]]))
             covariance = a_T_first.compose(belief).compose(second_T_b).covariance
-            arcs[a, b] = PoseGaussian(refined.arcs[a, b].mean, covariance)
+            before = refined.arcs[a, b]
+            arcs[a, b] = PoseGaussian(before.mean, _with_open_positions(covariance, before.covariance, self._capture))
         return replace(refined, arcs=refined.arcs | arcs)
 
     def _scan_pairs(self, poses: Float64, areas: Int64) -> ScanPairs:
@@ -150,6 +153,21 @@ class ClosureRefinement:
         if number_difference > _SAME_TRAVERSAL:
             return np.diag([self._options.first_gate, self._options.first_gate, _NEW_TRAVERSAL_ANGLE]) ** 2
         return path_covariance(float(np.hypot(step[0], step[1])), abs(float(step[2])), self._motion)
+
+
+def _with_open_positions(covariance: Float64, before: Float64, capture: float) -> Float64:
+    """A covariance after a refinement, with that of before along positions that were known no better than it captures.
+
+    A refinement ends at the next structure that looks alike, and its covariance is that of this one.
+
+    :param before: of the same arc, shape (3, 3).
+    :param capture: distance within which the refinement finds its structure, m.
+    """
+    values, vectors = np.linalg.eigh(before[:2, :2])
+    is_open = values > capture**2
+    opened = covariance.copy()
+    opened[:2, :2] += (vectors[:, is_open] * values[is_open]) @ vectors[:, is_open].T
+    return opened
 
 
 def _connected_groups(hybrid_map: HybridMap, closed: Collection[int]) -> list[list[int]]:
