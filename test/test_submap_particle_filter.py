@@ -216,6 +216,23 @@ def test_a_change_of_area_moves_frame_and_map_together():
     assert mapping.pool.patches_in_use == 0
 
 
+def test_in_another_area_each_particle_stays_where_it_is_from_the_newest_keyframe():
+    """Where the robot saw nothing the particles spread, so that each has the first keyframe of the area elsewhere."""
+    area_filter = ParticleFilter(LocalMapping(Configuration()), 0, 0)
+    blank = PreparedScan(area_filter.mapping, blank_scan())
+    area_filter.track(blank, make_prediction([8.0, 0.0, 0.0], np.diag([2.0, 2.0, 0.3]) ** 2))
+    area_filter.update(blank, 1)
+    scan = scan_in(ROOM, np.zeros(3))
+    area_filter.add_keyframe(1, scan)
+    seen = np.random.default_rng(0).normal(size=area_filter.poses.shape) * [0.02, 0.02, 0.01]
+    area_filter.poses = se2.compose(area_filter.poses, seen)
+    leader, new_T_old = area_filter.pose.copy(), se2.inverse(area_filter.leading_keyframe_poses()[-1])
+    assert area_filter.poses[:, :2].std() > 1.0
+    area_filter.change_area(3, new_T_old, [PlacedKeyframe(1, 3, scan, np.zeros(3))])
+    np.testing.assert_allclose(area_filter.poses, seen, atol=1e-9)
+    np.testing.assert_allclose(area_filter.pose, se2.compose(new_T_old, leader), atol=1e-9)
+
+
 def test_beams_beyond_the_range_tell_free_space_up_to_it():
     configuration = Configuration()
     mapping = LocalMapping(replace(configuration, local_map=replace(configuration.local_map, max_range=5.0)))

@@ -353,11 +353,18 @@ class ParticleFilter:
         self.keyframe_poses = self.keyframe_poses[:, remaining]
 
     def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
-        """Change to the frame of another area and load its local map, the same for all particles."""
+        """Change to the frame of another area and load its local map, the same for all particles.
+
+        A new area begins with the newest keyframe where the leading particle has it, so each particle stays where it is
+        from there. What they differ by until then is in the covariance of the arc.
+        """
         self._end_diverged_modes()
+        begins_here = self._begins_here(area, content)
         self.area = area
-        previous = (self.poses, self._predicted_poses, self._last_poses)
-        self.poses, self._predicted_poses, self._last_poses = (se2.compose(area_T_previous, own) for own in previous)
+        if begins_here:
+            own = self.keyframe_poses[:, -1]
+            self._move_particles(se2.compose(own[self.leader], se2.inverse(own)))
+        self._move_particles(np.repeat(area_T_previous[None], len(self.poses), axis=0))
         self._load_submap(content)
 
     def reload(self, content: Sequence[PlacedKeyframe], anchor: int) -> None:
@@ -368,6 +375,18 @@ class ParticleFilter:
         self._load_submap(content)
         after = self.keyframe_poses[:, self.keyframes.index(anchor)]
         self.poses, self._predicted_poses, self._last_poses = (se2.compose(after, poses) for poses in relative)
+
+    def _begins_here(self, area: int, content: Sequence[PlacedKeyframe]) -> bool:
+        """Whether an area is new: all its keyframes, of which one is the newest, were of another area before."""
+        before = dict(zip(self.keyframes, self.keyframe_areas, strict=True))
+        entered = [placed.keyframe for placed in content if placed.area == area]
+        is_new = all(before.get(keyframe, area) != area for keyframe in entered)
+        return is_new and bool(self.keyframes) and self.keyframes[-1] in entered
+
+    def _move_particles(self, motions: Float64) -> None:
+        """Move each particle in the map by a motion of its own, (m, 3)."""
+        previous = (self.poses, self._predicted_poses, self._last_poses)
+        self.poses, self._predicted_poses, self._last_poses = (se2.compose(motions, own) for own in previous)
 
     def _end_diverged_modes(self) -> None:
         """End the modes whose maps end; the covariances that the filter steps gave have what they differ by."""
