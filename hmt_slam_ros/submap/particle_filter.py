@@ -25,7 +25,7 @@ from hmt_slam_ros.registration.match_covariance import MatchError, estimate_matc
 from hmt_slam_ros.registration.scan_to_map import Prior
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.motion_model import Prediction
-from hmt_slam_ros.sensors.relative_motion import is_wide
+from hmt_slam_ros.sensors.relative_motion import has_wide_heading, is_wide
 from hmt_slam_ros.submap.local_filter import (
     FilterStep,
     LineFilterState,
@@ -355,15 +355,15 @@ class ParticleFilter:
     def change_area(self, area: int, area_T_previous: Float64, content: Sequence[PlacedKeyframe]) -> None:
         """Change to the frame of another area and load its local map, the same for all particles.
 
-        A new area begins with the newest keyframe where the leading particle has it, so each particle stays where it is
-        from there. What they differ by until then is in the covariance of the arc.
+        That has the newest keyframe where the leading particle has it. Particles that are farther apart than keyframes
+        stay where they are from that keyframe. What they differ by is in the covariance of the arc.
         """
         self._end_diverged_modes()
-        begins_here = self._begins_here(area, content)
         self.area = area
-        if begins_here:
+        if self.keyframes and self.keyframes[-1] in {placed.keyframe for placed in content}:
             own = self.keyframe_poses[:, -1]
-            self._move_particles(se2.compose(own[self.leader], se2.inverse(own)))
+            if self._are_scattered(own):
+                self._move_particles(se2.compose(own[self.leader], se2.inverse(own)))
         self._move_particles(np.repeat(area_T_previous[None], len(self.poses), axis=0))
         self._load_submap(content)
 
@@ -376,12 +376,13 @@ class ParticleFilter:
         after = self.keyframe_poses[:, self.keyframes.index(anchor)]
         self.poses, self._predicted_poses, self._last_poses = (se2.compose(after, poses) for poses in relative)
 
-    def _begins_here(self, area: int, content: Sequence[PlacedKeyframe]) -> bool:
-        """Whether an area is new: all its keyframes, of which one is the newest, were of another area before."""
-        before = dict(zip(self.keyframes, self.keyframe_areas, strict=True))
-        entered = [placed.keyframe for placed in content if placed.area == area]
-        is_new = all(before.get(keyframe, area) != area for keyframe in entered)
-        return is_new and bool(self.keyframes) and self.keyframes[-1] in entered
+    def _are_scattered(self, poses: Float64) -> bool:
+        """Whether poses of the particles, (m, 3), are farther from the leading one than keyframes from each other."""
+        offsets = se2.between(poses[self.leader], poses)
+        moment = (normalize_weights(self.log_weights)[:, None] * offsets).T @ offsets
+        settings = self.mapping.configuration.filter
+        largest = float(np.linalg.eigvalsh(moment[:2, :2])[-1])
+        return largest > settings.keyframe_distance**2 or has_wide_heading(moment, settings)
 
     def _move_particles(self, motions: Float64) -> None:
         """Move each particle in the map by a motion of its own, (m, 3)."""
