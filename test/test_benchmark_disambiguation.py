@@ -104,4 +104,6 @@ def test_from_a_question_in_twin_rooms_the_run_goes_on_in_three_ways():
     assert found is not None
     assert set(found.drives) == {DISAMBIGUATING, EXPLORING, ROUTE}
     assert found.drives[DISAMBIGUATING].verdict == "right"
-    assert 0.0 < found.drives[DISAMBIGUATING].distance <= found.drives[ROUTE].distance
+    # Which way is shorter in one world is the benchmark's question.
+    assert all(0.0 < drive.distance <= drive.driven for drive in found.drives.values() if drive.verdict != "open")
+    assert found.drives[DISAMBIGUATING].right_distance < LIMIT
