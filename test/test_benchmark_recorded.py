@@ -128,7 +128,7 @@ class TestPlaces:
     # 30 m out, 30 m back, and 30 m on into new ground.
     TRUTH = np.concatenate((line(60), line(60)[::-1], -line(60)))
 
-    def test_a_robot_is_put_down_on_known_or_on_new_ground(self):
+    def test_a_displaced_robot_is_on_known_or_on_new_ground(self):
         found = find_places(self.TRUTH, 50)
         before, again, new = (np.flatnonzero(found[kind]) for kind in KINDS)
         assert before.max() == 44  # 3 m away

@@ -6,16 +6,15 @@ from functools import cache
 
 import numpy as np
 import pytest
+from laps import CONFIGURATION, map_lap
 from worlds import box, scan_at
 
-from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import consistent_map
 from hmt_slam_ros.hybrid_map.shortest_path import map_pieces
 from hmt_slam_ros.messages.team import Verdict
-from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.team.components import Component, combine, renumber
 from hmt_slam_ros.team.join import decide, join_at, meet
@@ -24,25 +23,13 @@ from hmt_slam_ros.team.placement_evidence import PlacementEvidence
 from hmt_slam_ros.team.team_map import merge_components
 from hmt_slam_ros.team.windows import Window
 
-CONFIGURATION = Configuration(seed=50)
 OFFICE, OTHER, RING = "sim:office,size=0.7,seed=51", "sim:office,size=0.7,seed=50", "sim:ring,seed=50"
 TIGHT = np.diag([0.02, 0.02, 0.005]) ** 2
 
 
 @cache
-def half(world, number):
-    """The map of the first or the second half of a drive, which goes twice along the same way."""
-    duration = open_log(world).duration
-    log = open_log(world, start=0.5 * duration * number, duration=0.5 * duration)
-    result = run_log(log, CONFIGURATION)
-    progress = result.log_progress
-    recording = result.recorder.finish(progress.stamps, progress.first_scans, progress.earlier_trajectory)
-    return Component.of_map(recording.hybrid_map, recording.replica.scans)
-
-
-@cache
 def meeting(first, second):
-    return meet(half(*first), half(*second), CONFIGURATION)
+    return meet(map_lap(*first), map_lap(*second), CONFIGURATION)
 
 
 def keyframe_poses(component):
@@ -78,10 +65,10 @@ def test_the_halves_are_joined_alike_in_the_other_order():
 
 
 def test_the_same_maps_give_the_same_distribution_whatever_their_numbers():
-    one, second = meeting((OFFICE, 0), (OFFICE, 1)), half(OFFICE, 1)
+    one, second = meeting((OFFICE, 0), (OFFICE, 1)), map_lap(OFFICE, 1)
     shifted = Component(renumber(second.hybrid_map, 5, 1000), {k + 1000: scan for k, scan in second.scans.items()})
     for again in (second, shifted):
-        other = meet(half(OFFICE, 0), again, CONFIGURATION)
+        other = meet(map_lap(OFFICE, 0), again, CONFIGURATION)
         for before, now in zip(one.distribution.placements, other.distribution.placements, strict=True):
             assert before.probability == now.probability
             np.testing.assert_array_equal(before.pose, now.pose)
@@ -100,7 +87,7 @@ def test_of_a_ring_with_equal_sides_four_placements_keep_their_probabilities():
 
 
 def test_a_third_map_joins_the_piece_that_it_fits():
-    parts = {"a": half(OFFICE, 0), "other": half(OTHER, 0), "b": half(OFFICE, 1)}
+    parts = {"a": map_lap(OFFICE, 0), "other": map_lap(OTHER, 0), "b": map_lap(OFFICE, 1)}
     team = merge_components(parts, CONFIGURATION)
     assert [piece.name for piece in team.pieces] == ["a + b", "other"]
     assert [met.meeting.verdict for met in team.meetings] == [Verdict.APART, Verdict.JOINED, Verdict.APART]

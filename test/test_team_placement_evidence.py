@@ -61,5 +61,5 @@ def test_false_placements_show_how_long_surroundings_stay_similar():
     assert 0.1 < prior < 0.3
     assert similar_probability([{0: fits, 1: fits, 2: fits}] * 5) > 0.8
     assert similar_probability([{0: fits, 1: differs, 2: differs}] * 5) < 0.05
-    # Ground that the other robot does not know says nothing, nor does a placement that fits nowhere.
+    # Ground that the other robot does not know is no evidence, nor is a placement that fits nowhere.
     assert similar_probability([{0: fits, 1: elsewhere}, {0: differs, 1: differs}, {}]) == prior

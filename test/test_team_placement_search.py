@@ -1,32 +1,21 @@
 """The search of a component in another one while both grow."""
 
-from functools import cache
-
 import pytest
+from laps import CONFIGURATION, map_lap
 
-from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.team import Verdict
-from hmt_slam_ros.offline.run import run_log
-from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.team.components import Component, Shift, combine
 from hmt_slam_ros.team.join import judge
 from hmt_slam_ros.team.placement_search import PlacementSearch
 
-CONFIGURATION = Configuration(seed=50)
 WORLD = "sim:office,size=0.7,seed=51"
 SHIFT = Shift(1000, 10_000)
 
 
-@cache
 def lap(number):
     """The map of a lap."""
-    duration = open_log(WORLD).duration
-    log = open_log(WORLD, start=0.5 * duration * number, duration=0.5 * duration)
-    result = run_log(log, CONFIGURATION)
-    progress = result.log_progress
-    recording = result.recorder.finish(progress.stamps, progress.first_scans, progress.earlier_trajectory)
-    return Component.of_map(recording.hybrid_map, recording.replica.scans)
+    return map_lap(WORLD, number)
 
 
 def part(component, share, first=0.0):
