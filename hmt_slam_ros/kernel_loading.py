@@ -17,7 +17,7 @@ from typing import Any
 
 from hmt_slam_ros.compilation import declared_kernels
 from hmt_slam_ros.kernel_table import KernelCall, known_calls
-from hmt_slam_ros.process_table import COMPANIONS, PROCESSES
+from hmt_slam_ros.process_table import node_rows
 
 COMPILING = "compiling kernels"
 """Beginning of the progress, in diagnostics and on a terminal."""
@@ -59,7 +59,7 @@ class KernelLoading:
 
     def load_cached(self) -> list[KernelCall]:
         """Load what is cached, and the node's libraries; returns the calls of the kernels that are not."""
-        for row in (*PROCESSES, *COMPANIONS):
+        for row in node_rows():
             for library in row.libraries if row.name == self._user else ():
                 import_module(library)
         missing = []

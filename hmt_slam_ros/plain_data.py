@@ -11,6 +11,7 @@ import math
 import types
 from collections.abc import Callable, Hashable, Mapping, Set
 from dataclasses import fields, is_dataclass
+from enum import StrEnum
 from functools import cache
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
@@ -93,7 +94,8 @@ class PlainDataReader:
             return self._object(cast(type, kind))
         if origin in (Union, types.UnionType):
             return self._union(field, arguments)
-        return self._literal(arguments) if origin is Literal else self._collection(origin, arguments)
+        words = _words(kind)
+        return self._literal(words) if words else self._collection(origin, arguments)
 
     def _collection(self, origin: object, arguments: tuple[Any, ...]) -> Reader:
         if origin is tuple and len(arguments) == 2 and arguments[1] is Ellipsis:
@@ -177,11 +179,11 @@ class PlainDataReader:
 
         return read
 
-    def _literal(self, words: tuple[str, ...]) -> Reader:
+    def _literal(self, values: Mapping[str, object]) -> Reader:
         def read(content: object, path: str) -> object:
-            if content not in words:
-                raise self.error_at(path, content, " or ".join(words))
-            return content
+            if not isinstance(content, str) or content not in values:
+                raise self.error_at(path, content, " or ".join(values))
+            return values[content]
 
         return read
 
@@ -205,6 +207,13 @@ class PlainDataReader:
         return HmtSlamError(
             f"{path} = {shorten(content)} is not {wanted}: see {self.format_reference} for the document's form"
         )
+
+
+def _words(kind: Hashable) -> dict[str, object]:
+    """{word in a document: value} of a literal or an enumeration, empty for other types."""
+    if isinstance(kind, type) and issubclass(kind, StrEnum):
+        return {member.value: member for member in kind}
+    return {word: word for word in get_args(kind)} if get_origin(kind) is Literal else {}
 
 
 def is_record(kind: object) -> bool:

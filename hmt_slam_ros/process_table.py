@@ -14,6 +14,8 @@ _COMPOSITION = "hmt_slam_ros.composition"
 _MESSAGES = "hmt_slam_ros.messages.messages"
 _DOCUMENTS = "hmt_slam_ros.messages.documents"
 _ROS = "hmt_slam_ros.ros"
+_TEAM = "hmt_slam_ros.messages.team"
+_TEAM_MESSAGES = ("TeamStatus", "TeamRequest", "TeamUpdate", "TeamPlacement")
 _TOPOLOGY_NICENESS = 5  # a quarter of a core beside a program of niceness 0
 
 RUN_NODE = f"{_ROS}.run_node"
@@ -81,7 +83,7 @@ class DocumentRow:
     """A message that travels as a JSON document on a topic of its own.
 
     :ivar message: "module:Class" of the message.
-    :ivar topic: name of the topic, relative to the namespace.
+    :ivar topic: name of the topic, relative to the namespace; absolute where all robots of a team share it.
     :ivar document: name of the document.
     :ivar version: version of the document; raise it with every change of the class.
     """
@@ -149,7 +151,20 @@ PROCESSES: tuple[ProcessRow, ...] = (
         produces=("RealTimePose",),
     ),
 )
-"""The processes, in the order in which messages are delivered."""
+"""The processes of every robot, in the order in which messages are delivered."""
+
+TEAM = ProcessRow(
+    name="team",
+    title="a team of robots",
+    node_class=f"{_ROS}.team_node:TeamNode",
+    consumes=("Keyframe", "Hypotheses", "ClosureDecision", *_TEAM_MESSAGES),
+    factory="hmt_slam_ros.team.team:Team",
+    state="hmt_slam_ros.team.team:TeamState",
+    libraries=("scipy.special", "scipy.sparse.csgraph", "scipy.sparse.linalg"),
+    produces=_TEAM_MESSAGES,
+    niceness=_TOPOLOGY_NICENESS,
+)
+"""The sixth process, of a robot in a team; it takes no part in saves, and a map has no state of it."""
 
 COMPANIONS: tuple[NodeRow, ...] = (
     NodeRow(
@@ -178,13 +193,6 @@ RECORDER = NodeRow(
 )
 """The recorder of both runtimes. In a replay, its node runs in the OS process that started the others."""
 
-TEAM = NodeRow(
-    "team",
-    "a team of robots",
-    consumes=("Keyframe", "Hypotheses", "ClosureDecision", "TeamStatus", "TeamRequest", "TeamUpdate"),
-)
-"""The process of a robot in a team, which receives from its robot's processes and from other robots."""
-
 DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow(f"{_DOCUMENTS}:KeyframeHeader", "hmt/keyframes", "keyframe", 12),
     DocumentRow(f"{_MESSAGES}:AreaEvents", "hmt/area_events", "area_events", 4),
@@ -202,6 +210,10 @@ DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow("hmt_slam_ros.messages.tasks:PlaceEstimate", "pilot/place_estimate", "place_estimate", 2),
     DocumentRow(f"{_MESSAGES}:EarlyEstimate", "hmt/early_estimate", "early_estimate", 1),
     DocumentRow("hmt_slam_ros.messages.ambiguity:Ambiguity", "hmt/ambiguity", "ambiguity", 1),
+    DocumentRow(f"{_TEAM}:TeamStatus", "/team/statuses", "team_status", 1),
+    DocumentRow(f"{_TEAM}:TeamRequest", "/team/requests", "team_request", 1),
+    DocumentRow(f"{_TEAM}:TeamUpdate", "/team/updates", "team_update", 1),
+    DocumentRow(f"{_TEAM}:TeamPlacement", "/team/placements", "team_placement", 1),
 )
 """Messages that travel as JSON documents."""
 
@@ -229,9 +241,14 @@ def participant_names() -> tuple[str, ...]:
     return tuple(name for name in process_names() if name != COORDINATOR)
 
 
+def node_rows() -> tuple[NodeRow, ...]:
+    """Rows of all nodes that have an executable."""
+    return (*PROCESSES, TEAM, *COMPANIONS)
+
+
 def node_names() -> tuple[str, ...]:
     """Names of all nodes that have an executable."""
-    return tuple(row.name for row in (*PROCESSES, *COMPANIONS))
+    return tuple(row.name for row in node_rows())
 
 
 def program_names() -> tuple[str, ...]:
@@ -241,12 +258,12 @@ def program_names() -> tuple[str, ...]:
 
 def process_row(name: str) -> ProcessRow:
     """The row of a process."""
-    return next(row for row in PROCESSES if row.name == name)
+    return next(row for row in (*PROCESSES, TEAM) if row.name == name)
 
 
 def node_row(name: str) -> NodeRow:
     """The row of a node that has an executable."""
-    return next(row for row in (*PROCESSES, *COMPANIONS) if row.name == name)
+    return next(row for row in node_rows() if row.name == name)
 
 
 def producer(message: str) -> str:

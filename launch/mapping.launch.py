@@ -6,7 +6,7 @@ from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, LaunchLogDir, PathJoinSubstitution
 from launch_ros.actions import Node
 
-from hmt_slam_ros.process_table import ALL, process_names
+from hmt_slam_ros.process_table import ALL, TEAM, process_names
 from hmt_slam_ros.ros.launch_actions import PACKAGE, RESPAWN, common_arguments, node, switch, value
 
 PARAMETERS = {
@@ -51,6 +51,7 @@ def _arguments() -> list[DeclareLaunchArgument]:
         switch("save_on_shutdown", "false", "Whether the map is saved there before the nodes end."),
         switch("one_program", "false", "Whether one program forks all nodes, which takes two thirds of the memory."),
         switch("autostart", "true", "Whether the nodes begin by themselves; else a lifecycle manager leads them."),
+        switch("team", "false", "Whether the robot shares its map with others; its namespace is its name there."),
     ]
 
 
@@ -61,7 +62,9 @@ def _processes(context: LaunchContext) -> list[Node]:
     if mode:
         parameters["mode"] = mode
     log_level = ["--log-level", LaunchConfiguration("log_level")]
-    programs = [ALL] if is_one_program else process_names()
+    programs = [ALL] if is_one_program else list(process_names())
+    if LaunchConfiguration("team").perform(context) == "true":
+        programs.append(TEAM.name)
     return [node(program, parameters, ros_arguments=log_level, **RESPAWN) for program in programs]
 
 

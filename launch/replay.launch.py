@@ -18,6 +18,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("log", default_value=bundled, description=formats),
             rate_argument(),
             switch("rviz", "false", "Whether RViz is started."),
+            switch("team", "false", "Whether the robot shares its map with others; its namespace is its name there."),
             *common_arguments(),
             # Where rviz2 is not installed, launch gives up before the other nodes run.
             Node(
@@ -27,7 +28,7 @@ def generate_launch_description() -> LaunchDescription:
                 parameters=[{"use_sim_time": True}],
                 condition=IfCondition(LaunchConfiguration("rviz")),
             ),
-            mapping(),
+            mapping("team"),
             robot("log"),
         ]
     )

@@ -12,7 +12,7 @@ from string import Template
 
 from hmt_slam_ros.configuration import Configuration, flat_parameters
 from hmt_slam_ros.configuration.documents import parameter_reference, parameter_table, ros_yaml
-from hmt_slam_ros.process_table import COMPANIONS, COORDINATOR, DOCUMENTS, PROCESSES, RECORDER, NodeRow, ProcessRow
+from hmt_slam_ros.process_table import COORDINATOR, DOCUMENTS, RECORDER, TEAM, NodeRow, ProcessRow, node_rows
 from hmt_slam_ros.results.hmt_map import PARTS, ChainState, MapDocument
 from hmt_slam_ros.results.log_reading import FIXED_PARAMETERS
 from hmt_slam_ros.saved_map.folder import FORMAT, SCANS, VERSION
@@ -148,6 +148,7 @@ _FURTHER_PUBLISHED: dict[str, tuple[str, ...]] = {
     "tsbi": ("hmt/pmf", "hmt/is_localized", "hmt/entropy"),
     "tlca": ("map", "hmt/graph", "hmt/ambiguity_goal"),
     "rtl": ("tf",),
+    "team": ("tf",),
     "robot": ("scan", "odom", "/clock", "hmt/robot_status", "tf", "tf_static", "ground_truth"),
     "explorer": _TASK_TOPICS,
     "pilot": (*_TASK_TOPICS, "pilot/place_estimate", "initialpose"),
@@ -162,6 +163,7 @@ _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
         *("hmt/entropy", "hmt/robot_status", "diagnostics"),
     ),
     "robot": ("hmt/local_estimate", "hmt/tracking_reset", "diagnostics"),
+    "team": ("hmt/reset_request",),
     "explorer": ("hmt/reset_request", "tf_static"),
     "pilot": ("hmt/reset_request", "tf_static"),
     "recorder": ("hmt/area_events", "hmt/robot_status", "diagnostics", "hmt/cost"),
@@ -210,7 +212,7 @@ def _publications(row: NodeRow) -> Iterator[str]:
     if isinstance(row, ProcessRow):
         for message in (*row.produces, "Notice"):
             yield from _MESSAGE_TOPICS[message]
-        if row.name != COORDINATOR:
+        if row.name not in (COORDINATOR, TEAM.name):
             yield from _RESPONSES
     yield from _FURTHER_PUBLISHED.get(row.name, ())
 
@@ -220,14 +222,14 @@ def _subscriptions(row: NodeRow) -> Iterator[str]:
     yield from ("/clock", "/parameter_events")
     for message in row.consumes:
         yield from _MESSAGE_TOPICS[message]
-    if isinstance(row, ProcessRow) and row.name != COORDINATOR:
+    if isinstance(row, ProcessRow) and row.name not in (COORDINATOR, TEAM.name):
         yield from _REQUESTS
     yield from _FURTHER_SUBSCRIBED.get(row.name, ())
 
 
 def sros2_policy(_configuration: Configuration) -> str:
     """config/sros2_policy.xml: what each node may publish, subscribe to, answer and request, as sros2 reads it."""
-    rows = (*PROCESSES, *COMPANIONS, RECORDER)
+    rows = (*node_rows(), RECORDER)
     operator = NodeRow("operator", "a person at the command line or RViz")
     enclaves = [_enclave(row, (), _services(row)) for row in rows]
     requests = [f"{row.name}/{service}" for row in rows for service in _services(row)]

@@ -37,6 +37,7 @@ COMMANDS: tuple[tuple[str, ...], ...] = (
     ("map", "sim:office,seed=5", "--duration", "120", "--set", "local_map.kind=lines"),
     ("map", "sim:nested", "--duration", "600"),
     ("map", "sim:institute", "--duration", "200"),
+    ("map", "sim:office,size=0.7,seed=51", "sim:office,size=0.7,seed=51,visit=1", "--team", "--duration", "150"),
     ("doctor", BUNDLED),
     ("doctor", "sim:office", "--duration", "60"),
 )
@@ -145,16 +146,16 @@ def run_command(folder: Path, *words: str) -> None:
     from hmt_slam_ros.cli.main import main as run_main  # noqa: PLC0415  after the settings of numpy
     from hmt_slam_ros.process_table import ProcessRow  # noqa: PLC0415
 
-    inputs: dict[str, list[bytes]] = defaultdict(list)
+    inputs: dict[str, list[bytes]] = {}
     make = ProcessRow.make
 
     def make_recorded(row: ProcessRow, configuration: Any, state: Any = None) -> Any:  # noqa: ANN401  any process
-        inputs[row.name] = [pickle.dumps((configuration, state))]
+        own = inputs[row.name] = [pickle.dumps((configuration, state))]  # of a team, those of the last robot
         process = make(row, configuration, state)
         handle = process.handle
 
         def handle_recorded(message: Any) -> Any:  # noqa: ANN401  any message
-            inputs[row.name].append(pickle.dumps(message))
+            own.append(pickle.dumps(message))
             return handle(message)
 
         process.handle = handle_recorded

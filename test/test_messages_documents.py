@@ -38,6 +38,7 @@ from hmt_slam_ros.messages.messages import (
     TrackingReset,
 )
 from hmt_slam_ros.messages.tasks import PlaceEstimate
+from hmt_slam_ros.messages.team import TeamMessage, Verdict
 from hmt_slam_ros.plain_data import field_names, is_record
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import Scan
@@ -59,27 +60,38 @@ KINDS = (
     ResetResponse,
     PlaceEstimate,
     Ambiguity,
+    *get_args(TeamMessage),
 )
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
+SINGLES = st.floats(allow_nan=False, allow_infinity=False, width=32)
+RANGES = st.lists(st.floats(width=32), max_size=5).map(lambda ranges: np.array(ranges, dtype=np.float32))
 
 
 def values(kind, name=""):
     """Any value that a field of this type may have."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is np.ndarray:
-        shape = (3, 3) if name in ("covariance", "ambiguity") else (3,)
-        count = int(np.prod(shape))
-        return st.lists(NUMBERS, min_size=count, max_size=count).map(lambda flat: np.array(flat).reshape(shape))
-    if origin is Literal:
-        return st.sampled_from(arguments)
+        return (
+            RANGES if name in ("ranges", "starts") else arrays((3, 3) if name in ("covariance", "ambiguity") else (3,))
+        )
     if origin is tuple:
         return st.lists(values(arguments[0]), max_size=3).map(tuple)
     if origin in (Union, types.UnionType):
-        return st.none() | values(arguments[0])
+        return st.none() | values(arguments[0], name)
     if is_record(kind):
         hints = get_type_hints(kind)
-        return st.builds(kind, **{name: values(hints[name], name) for name in field_names(kind)})
+        # The numbers of a scan are rounded to float32.
+        singles = {entry: SINGLES for entry in field_names(kind) if kind is Scan and hints[entry] is float}
+        others = {entry: values(hints[entry], entry) for entry in field_names(kind) if entry not in singles}
+        return st.builds(kind, **singles, **others)
+    if origin is Literal or kind is Verdict:
+        return st.sampled_from(arguments or kind)
     return {bool: st.booleans(), int: st.integers(-(2**63), 2**63 - 1), float: NUMBERS, str: st.text()}[kind]
+
+
+def arrays(shape):
+    count = int(np.prod(shape))
+    return st.lists(NUMBERS, min_size=count, max_size=count).map(lambda flat: np.array(flat).reshape(shape))
 
 
 def assert_same(a, b):

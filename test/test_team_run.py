@@ -15,7 +15,7 @@ from hmt_slam_ros.offline.team_run import TeamRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.team import shared_map
 from hmt_slam_ros.team import team as team_module
-from hmt_slam_ros.team.team import MAX_ROBOTS, Team
+from hmt_slam_ros.team.team import MAX_ROBOTS, Team, TeamState
 
 CONFIGURATION = Configuration(seed=50)
 OFFICE, OTHER = "sim:office,size=0.7,seed=51", "sim:office,size=0.7,seed=50"
@@ -106,12 +106,12 @@ class Network:
     def __init__(self):
         run, _, _ = office_run()
         self.ann = run.teams["ann"]
-        self.new = Team(CONFIGURATION, "zoe", "s")
+        self.new = Team(CONFIGURATION, TeamState("zoe", "s"))
 
     def pass_messages(self, lost=0.0, repeated=1, seed=0):
         """Let Ann say her status until Zoe has all, and return the number of statuses."""
         random = np.random.default_rng(seed)
-        for count in range(1, 100):
+        for count in range(1, 1000):
             waiting = [(self.new, self.ann.status)]
             while waiting:
                 receiver, message = waiting.pop(0)
@@ -121,13 +121,13 @@ class Network:
                     answers = receiver.handle(message)
                 other = self.ann if receiver is self.new else self.new
                 waiting += [(other, each) for each in answers if not isinstance(each, TeamPlacement)]
-            if not self.new.handle(self.ann.status):
+            if self.new._others and self.new._others["ann"].map.version == self.ann.status.map_version:
                 return count
         raise AssertionError
 
 
 def component(team, name):
-    return team._others[name].component()
+    return team._others[name].map.component()
 
 
 def test_a_robot_that_joins_late_gets_the_whole_map():
@@ -137,7 +137,7 @@ def test_a_robot_that_joins_late_gets_the_whole_map():
 
 
 def test_lost_and_repeated_messages_change_nothing_in_the_end(monkeypatch):
-    monkeypatch.setattr(shared_map, "UPDATE_BYTES", 10_000)
+    monkeypatch.setattr(shared_map, "UPDATE_BYTES", 20_000)
     network = Network()
     assert network.pass_messages(lost=0.3, repeated=2) > 1
     assert set(component(network.new, "ann").scans) == set(network.ann._own.component().scans)
@@ -146,12 +146,12 @@ def test_lost_and_repeated_messages_change_nothing_in_the_end(monkeypatch):
 def test_another_session_of_a_robot_is_another_map():
     network = Network()
     network.pass_messages()
-    assert network.new.handle(TeamStatus("ann", "later", 3)) == [TeamRequest("zoe", "ann", "later", 0)]
+    assert network.new.handle(TeamStatus("ann", "later", 3, "0")) == [TeamRequest("zoe", "ann", "later", 0)]
     assert not component(network.new, "ann").scans
 
 
 def test_a_request_for_another_robot_or_session_is_not_answered():
-    team = Team(CONFIGURATION, "ann", "s")
+    team = Team(CONFIGURATION, TeamState("ann", "s"))
     for request in (TeamRequest("zoe", "bob", "s", 0), TeamRequest("zoe", "ann", "earlier", 0)):
         assert team.handle(request) == []
     (update,) = team.handle(TeamRequest("zoe", "ann", "s", 0))
@@ -159,16 +159,16 @@ def test_a_request_for_another_robot_or_session_is_not_answered():
 
 
 def test_updates_of_unknown_robots_and_the_own_status_do_nothing():
-    network, team = Network(), Team(CONFIGURATION, "bob", "s")
-    (update,) = network.ann.handle(TeamRequest("bob", "ann", network.ann.status.session, 0))
+    network, team = Network(), Team(CONFIGURATION, TeamState("bob", "s"))
+    (update,) = network.ann.handle(TeamRequest("eve", "ann", network.ann.status.session, 0))
     assert team.handle(update) == []
     assert team.handle(team.status) == []
     assert not team.is_searching
 
 
 def test_the_number_of_robots_is_bounded():
-    team = Team(CONFIGURATION, "ann", "s")
-    answers = [team.handle(TeamStatus(f"robot {n}", "s", 1)) for n in range(MAX_ROBOTS + 5)]
+    team = Team(CONFIGURATION, TeamState("ann", "s"))
+    answers = [team.handle(TeamStatus(f"robot {n}", "s", 1, "0")) for n in range(MAX_ROBOTS + 5)]
     assert sum(map(bool, answers)) == MAX_ROBOTS
 
 
@@ -181,7 +181,7 @@ def test_the_work_of_an_event_is_bounded(monkeypatch, limit):
     bob, waiting = deepcopy(run.teams["bob"]), [replace(run.teams["ann"].status, robot="abe")]
     while waiting:
         for request in bob.handle(waiting.pop()):
-            update = run.teams["ann"].handle(replace(request, owner="ann"))[0]
+            update = run.teams["ann"].handle(replace(request, owner="ann", robot="eve"))[0]
             waiting.append(replace(update, robot="abe"))
     assert bob.is_searching
     bob.search(limit)

@@ -7,7 +7,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.team import shared_map
-from hmt_slam_ros.team.shared_map import NEW_KEYFRAMES, ForeignMap, SharedMap
+from hmt_slam_ros.team.shared_map import NEW_KEYFRAMES, ForeignMap, ForeignMapState, SharedMap
 
 ROOM = worlds.box(-5.0, -5.0, 5.0, 5.0)
 STEP = PoseGaussian(np.array([4.0, 0.0, 0.0]), np.diag([0.01, 0.01, 0.001]))
@@ -73,22 +73,22 @@ def assert_same(foreign, robot, areas):
 
 
 def test_another_robot_gets_areas_scans_and_arcs():
-    robot, foreign = with_three_areas(), ForeignMap("a")
+    robot, foreign = with_three_areas(), ForeignMap(ForeignMapState("a"))
     assert receive(foreign, robot) == 1
     assert_same(foreign, robot, [0, 1, 2])
 
 
 def test_nothing_new_is_an_update_without_items():
-    robot, foreign = with_three_areas(), ForeignMap("a")
+    robot, foreign = with_three_areas(), ForeignMap(ForeignMapState("a"))
     receive(foreign, robot)
     assert not robot.share()
     update = robot.shared.update_after(foreign.version)
-    assert (update.scans, update.areas, update.version) == ((), (), foreign.version)
+    assert (update.scans, update.areas, update.until) == ((), (), foreign.version)
     assert not foreign.apply(update)
 
 
 def test_only_what_changed_comes_again():
-    robot, foreign = with_three_areas(), ForeignMap("a")
+    robot, foreign = with_three_areas(), ForeignMap(ForeignMapState("a"))
     receive(foreign, robot)
     assert robot.join(0, 2)
     update = robot.shared.update_after(foreign.version)
@@ -99,7 +99,7 @@ def test_only_what_changed_comes_again():
 
 
 def test_the_robots_own_area_is_shared_in_steps():
-    robot, foreign = Robot(), ForeignMap("a")
+    robot, foreign = Robot(), ForeignMap(ForeignMapState("a"))
     assert not robot.map_keyframes(0, NEW_KEYFRAMES - 1)
     assert robot.map_keyframes(0, 1)
     receive(foreign, robot)
@@ -113,14 +113,14 @@ def test_the_robots_own_area_is_shared_in_steps():
 
 def test_a_large_map_comes_in_parts(monkeypatch):
     monkeypatch.setattr(shared_map, "UPDATE_BYTES", 5_000)
-    robot, foreign = with_three_areas(), ForeignMap("a")
+    robot, foreign = with_three_areas(), ForeignMap(ForeignMapState("a"))
     assert receive(foreign, robot) > 3
     assert_same(foreign, robot, [0, 1, 2])
 
 
 def test_parts_hold_their_limit_and_one_item_at_least(monkeypatch):
     monkeypatch.setattr(shared_map, "UPDATE_BYTES", 1)
-    robot, foreign = with_three_areas(), ForeignMap("a")
+    robot, foreign = with_three_areas(), ForeignMap(ForeignMapState("a"))
     assert receive(foreign, robot) == 3 * 7
     assert_same(foreign, robot, [0, 1, 2])
 
@@ -128,7 +128,7 @@ def test_parts_hold_their_limit_and_one_item_at_least(monkeypatch):
 def test_areas_that_change_between_two_parts_lose_no_scan(monkeypatch):
     """The scans of area 0 come first, but the area itself comes last, since it changed meanwhile."""
     monkeypatch.setattr(shared_map, "UPDATE_BYTES", 5_000)
-    robot, foreign = with_three_areas(), ForeignMap("a")
+    robot, foreign = with_three_areas(), ForeignMap(ForeignMapState("a"))
     foreign.apply(robot.shared.update_after(0))
     robot.map.set_keyframe(0, 0, np.array([9.0, 0.0, 0.0]))
     robot.share()
@@ -138,7 +138,7 @@ def test_areas_that_change_between_two_parts_lose_no_scan(monkeypatch):
 
 def test_lost_repeated_and_late_updates_do_no_harm(monkeypatch):
     monkeypatch.setattr(shared_map, "UPDATE_BYTES", 5_000)
-    random, robot, foreign = np.random.default_rng(3), Robot(), ForeignMap("a")
+    random, robot, foreign = np.random.default_rng(3), Robot(), ForeignMap(ForeignMapState("a"))
     underway = []
     for event in range(300):
         if event < 100:
@@ -153,15 +153,15 @@ def test_lost_repeated_and_late_updates_do_no_harm(monkeypatch):
 
 
 def test_an_update_behind_a_gap_or_of_another_session_brings_nothing():
-    robot, foreign = with_three_areas(), ForeignMap("a")
+    robot, foreign = with_three_areas(), ForeignMap(ForeignMapState("a"))
     assert not foreign.apply(robot.shared.update_after(2))
-    other = ForeignMap("b")
+    other = ForeignMap(ForeignMapState("b"))
     assert not other.apply(robot.shared.update_after(0))
     assert foreign.version == other.version == 0
 
 
 def test_areas_that_are_gone_are_gone_everywhere():
-    robot, foreign = with_three_areas(), ForeignMap("a")
+    robot, foreign = with_three_areas(), ForeignMap(ForeignMapState("a"))
     receive(foreign, robot)
     robot.map.merge(2, 1, STEP)
     robot.share()
@@ -170,20 +170,20 @@ def test_areas_that_are_gone_are_gone_everywhere():
 
 
 def test_pruned_keyframes_are_gone_everywhere():
-    robot, foreign = with_three_areas(), ForeignMap("a")
+    robot, foreign = with_three_areas(), ForeignMap(ForeignMapState("a"))
     receive(foreign, robot)
     robot.map.remove_keyframe(3, 0)
     del robot.scans[3]
     robot.share()
     receive(foreign, robot)
     assert_same(foreign, robot, [0, 1, 2])
-    late = ForeignMap("a")
+    late = ForeignMap(ForeignMapState("a"))
     receive(late, robot)
     assert_same(late, robot, [0, 1, 2])
 
 
 def test_a_scan_that_changed_comes_again():
-    robot, foreign = with_three_areas(), ForeignMap("a")
+    robot, foreign = with_three_areas(), ForeignMap(ForeignMapState("a"))
     receive(foreign, robot)
     robot.scans[3] = worlds.scan_in(ROOM, (0.0, 1.0, 0.0), stamp=3)
     robot.map.set_keyframe(3, 0, robot.map.keyframes(0)[3])

@@ -1,11 +1,13 @@
 """Messages as versioned JSON documents, for topics without a standard ROS type.
 
-The form of a document follows from the class of its message (:mod:`hmt_slam_ros.plain_data`); an array is a list. A
-received document is checked against that class, so that no malformed message reaches a process.
+The form of a document follows from the class of its message (:mod:`hmt_slam_ros.plain_data`); an array is a list, and
+the ranges of a scan are the text of their bytes. A received document is checked against that class, so that no
+malformed message reaches a process.
 """
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, fields
@@ -179,7 +181,7 @@ def encode(message: object, reset_number: int = 0, system: str = "") -> str:
     :raises HmtSlamError: where a float is NaN or infinite.
     """
     name, version = _DOCUMENTS[type(message)]
-    content = {"document": name, "version": version, **to_plain(message, {np.ndarray: np.ndarray.tolist})}
+    content = {"document": name, "version": version, **to_plain(message, {np.ndarray: _array_form})}
     if reset_number:
         content["reset"] = reset_number
     if system:
@@ -223,8 +225,28 @@ def decode_with_reset(
     return _VALUES.read(content, kind, name), reset_number
 
 
+_FLOAT32 = np.dtype("<f4")
+
+
+def _array_form(array: NDArray[np.generic]) -> object:
+    """An array in a document: a list of numbers, or of ranges the text of their bytes."""
+    if array.dtype == np.float32:
+        return base64.b64encode(array.astype(_FLOAT32, copy=False).tobytes()).decode("ascii")
+    return array.tolist()
+
+
+def _read_ranges(content: object, path: str) -> object:
+    """The float32 numbers of a text; NaN and infinite ones are beams without a return."""
+    try:
+        return np.frombuffer(base64.b64decode(str(content), validate=True), _FLOAT32).astype(np.float32)
+    except ValueError:
+        raise _VALUES.error_at(path, content, "the bytes of float32 numbers in base64") from None
+
+
 def _array_reader(field: str, kind: Hashable) -> Reader:  # noqa: ARG001  all arrays have one type
-    """The reader of an array: a second moment, shape (3, 3), by its name, else a pose, shape (3,)."""
+    """The reader of an array, by its name: ranges, a second moment, shape (3, 3), or else a pose, shape (3,)."""
+    if field in ("ranges", "starts"):
+        return _read_ranges
     shape = (3, 3) if field in ("covariance", "ambiguity") else (3,)
     wanted = f"an array of finite numbers of shape {shape}"
 

@@ -6,6 +6,7 @@ themselves, and those of the chain also against the hypotheses that are alive. W
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -23,10 +24,18 @@ from hmt_slam_ros.messages.documents import (
     ResetResponse,
     SaveRequest,
     SaveResponse,
+    decode,
     decode_with_reset,
 )
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe
 from hmt_slam_ros.messages.system_name import SystemName
+from hmt_slam_ros.messages.team import (
+    MAX_TEAM_AREAS,
+    MAX_TEAM_KEYFRAMES,
+    TeamMessage,
+    TeamPlacement,
+    TeamUpdate,
+)
 from hmt_slam_ros.plain_data import field_names, is_record
 from hmt_slam_ros.process_table import participant_names
 from hmt_slam_ros.sensors.plausibility import MAX_COORDINATE, check_scan
@@ -45,6 +54,7 @@ MAX_VARIANCE = MAX_COORDINATE**2
 _TOLERANCE = 1e-6
 """Relative rounding of a covariance, and absolute of a sum of probabilities."""
 
+_TEAM_NAME = re.compile(r"[\w.:+-]{1,100}", re.ASCII)
 _REMEDY = "look for a second system or a stranger in this ROS domain, and give each system its own"
 _COUNTS = frozenset(
     (
@@ -73,6 +83,10 @@ _COUNTS = frozenset(
         "keyframe",
         "previous_area",
         "stamp",
+        "version",
+        "map_version",
+        "after",
+        "until",
     )
 )
 """Fields of whole numbers that are never negative."""
@@ -99,7 +113,7 @@ def check_message(message: object) -> None:
     for name, value in _walk(message):
         if isinstance(value, np.ndarray) and value.shape == (3, 3):
             matrices.append(value)
-        elif isinstance(value, np.ndarray) and value.shape == (3,):
+        elif isinstance(value, np.ndarray) and value.shape == (3,) and value.dtype == np.float64:
             _require(bool((np.abs(value) <= MAX_COORDINATE).all()), name, value.tolist(), "a pose within 1e7 m")
         elif type(value) is int and name in _COUNTS:
             _require(value >= 0, name, value, "0 or more")
@@ -121,6 +135,18 @@ def _check_kind(message: object) -> None:
         _check_request_number("number", message.number)
     elif isinstance(message, SaveResponse | ResetResponse):
         _check_response(message)
+    elif isinstance(message, TeamMessage):
+        _check_team_message(message)
+
+
+def decode_of_team(text: str, kind: type[Document]) -> Document:
+    """The message of a JSON document from any robot, whatever its system.
+
+    :raises HmtSlamError: where it is malformed, or :func:`check_message` refuses it.
+    """
+    message = decode(text, kind)
+    check_message(message)
+    return message
 
 
 def check_belief(belief: PoseGaussian, name: str) -> None:
@@ -239,6 +265,35 @@ def _check_response(response: SaveResponse | ResetResponse) -> None:
         names = {f"{response.process}.json", f"{response.process}.bin"}
         for file in response.files:
             _require(file.name in names and file.size >= 0, "file", file.name, "a file of that process")
+
+
+def _check_team_message(message: TeamMessage) -> None:
+    """Check the names, and what an update or a placement holds."""
+    for name in ("robot", "session", "owner", "first", "second", "digest"):
+        value = getattr(message, name, "-")
+        _require(bool(_TEAM_NAME.fullmatch(value)), name, value, "a name of 100 letters, digits and '_-.:+' at most")
+    if isinstance(message, TeamUpdate):
+        _check_update(message)
+    elif isinstance(message, TeamPlacement):
+        _require(message.first < message.second, "second", message.second, f"a name after {message.first}")
+        _require(message.robot in (message.first, message.second), "robot", message.robot, "a robot of the pair")
+        for probability in (message.probability, message.apart):
+            _require(0.0 <= probability <= 1.0, "probability", probability, "between 0 and 1")
+
+
+def _check_update(update: TeamUpdate) -> None:
+    for item in update.items:
+        _require(update.after < item.version <= update.until, "version", item.version, "one of the update")
+    for scan in update.scans:
+        _require(scan.keyframe < MAX_TEAM_KEYFRAMES, "keyframe", scan.keyframe, f"below {MAX_TEAM_KEYFRAMES}")
+        check_scan(scan.scan)
+    for area in update.areas:
+        _require(len(area.poses) == len(set(area.keyframes)), "poses", len(area.poses), "one for each keyframe")
+        for arc in area.arcs:
+            _require(arc.source < arc.target == area.area, "source", arc.source, "an area before that of the arc")
+        largest = max(area.area, *area.keyframes, 0)
+        _require(area.area < MAX_TEAM_AREAS, "area", area.area, f"below {MAX_TEAM_AREAS}")
+        _require(largest < MAX_TEAM_KEYFRAMES, "keyframe", largest, f"below {MAX_TEAM_KEYFRAMES}")
 
 
 def _require(holds: bool, name: str, value: object, wanted: str) -> None:

@@ -30,7 +30,7 @@ from hmt_slam_ros.messages.map_changes import (
     StaleBeams,
 )
 from hmt_slam_ros.messages.tasks import GoalPose, PlaceEstimate, Task, TaskResult, VelocityCommand
-from hmt_slam_ros.messages.team import TeamPlacement, TeamRequest, TeamStatus, TeamUpdate
+from hmt_slam_ros.messages.team import TeamMessage
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import Odometry, Scan
 
@@ -392,8 +392,5 @@ Message = (
     | TaskResult
     | VelocityCommand
     | PlaceEstimate
-    | TeamStatus
-    | TeamRequest
-    | TeamUpdate
-    | TeamPlacement
+    | TeamMessage
 )

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Protocol, get_args
 
 from hmt_slam_ros.messages.messages import Message
-from hmt_slam_ros.process_table import COMPANIONS, PROCESSES, RECORDER, TEAM, resolve_class
+from hmt_slam_ros.process_table import RECORDER, node_rows, resolve_class
 
 
 class Process(Protocol):
@@ -35,7 +35,5 @@ def message_types(names: Iterable[str]) -> tuple[type, ...]:
     return tuple(resolve_class(name) if ":" in name else _KINDS[name] for name in names)
 
 
-SUBSCRIPTIONS: dict[str, tuple[type, ...]] = {
-    row.name: message_types(row.consumes) for row in (*PROCESSES, *COMPANIONS, RECORDER, TEAM)
-}
+SUBSCRIPTIONS: dict[str, tuple[type, ...]] = {row.name: message_types(row.consumes) for row in (*node_rows(), RECORDER)}
 """{process or node: classes of the messages that it receives}."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hmt_slam_ros.messages.map_changes import Arc
+from hmt_slam_ros.messages.map_changes import Arc, Pose
 from hmt_slam_ros.sensors import Scan
+
+MAX_TEAM_AREAS, MAX_TEAM_KEYFRAMES = 2**16, 2**32
+"""Bounds of the numbers of areas and keyframes in the map of a robot of a team."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -33,15 +33,19 @@ class SharedArea:
     :ivar version: of the robot's map, at which it became part of it or changed.
     :ivar area: id of the area.
     :ivar keyframes: numbers of its n keyframes.
-    :ivar poses: shape (n, 3), ``area_T_base`` of each, m and rad.
+    :ivar poses: ``area_T_base`` of each, shape (3,), m and rad.
     :ivar arcs: to areas with smaller ids.
     """
 
     version: int
     area: int
     keyframes: tuple[int, ...]
-    poses: NDArray[np.float64]
+    poses: tuple[Pose, ...]
     arcs: tuple[Arc, ...]
+
+
+SharedItem = SharedScan | SharedArea
+"""A part of a map that has a version."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +54,14 @@ class TeamStatus:
 
     :ivar robot: name of the robot.
     :ivar session: of its map; versions of another session are not comparable.
-    :ivar version: 0 for an empty map.
+    :ivar map_version: 0 for an empty map.
+    :ivar digest: of all items of that version, hexadecimal.
     """
 
     robot: str
     session: str
-    version: int
+    map_version: int
+    digest: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +71,13 @@ class TeamRequest:
     :ivar robot: name of the robot that wants it.
     :ivar owner: name of the robot whose map it is.
     :ivar session: of that map.
-    :ivar version: up to which the map is known, 0 for nothing.
+    :ivar after: version up to which the map is known, 0 for nothing.
     """
 
     robot: str
     owner: str
     session: str
-    version: int
+    after: int
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -81,7 +87,7 @@ class TeamUpdate:
     :ivar robot: name of the robot.
     :ivar session: of its map.
     :ivar after: version before the changes.
-    :ivar version: version with them.
+    :ivar until: version with them.
     :ivar scans: by growing version.
     :ivar areas: likewise. The scans of their keyframes are here, or in an earlier update.
     :ivar is_complete: whether there is nothing newer.
@@ -90,10 +96,15 @@ class TeamUpdate:
     robot: str
     session: str
     after: int
-    version: int
+    until: int
     scans: tuple[SharedScan, ...]
     areas: tuple[SharedArea, ...]
     is_complete: bool
+
+    @property
+    def items(self) -> tuple[SharedItem, ...]:
+        """Scans and areas."""
+        return (*self.scans, *self.areas)
 
 
 class Verdict(StrEnum):
@@ -124,4 +135,8 @@ class TeamPlacement:
     verdict: Verdict
     probability: float
     apart: float
-    pose: NDArray[np.float64]
+    pose: Pose
+
+
+TeamMessage = TeamStatus | TeamRequest | TeamUpdate | TeamPlacement
+"""What robots of a team send one another."""

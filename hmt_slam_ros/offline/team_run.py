@@ -14,7 +14,7 @@ from hmt_slam_ros.messages.team import TeamPlacement
 from hmt_slam_ros.offline.lock_step import LockStepRun, RunResult
 from hmt_slam_ros.process_table import TEAM
 from hmt_slam_ros.results.hmt_map import RunState
-from hmt_slam_ros.team.team import Team
+from hmt_slam_ros.team.team import Team, TeamState
 
 
 class _Radio:
@@ -47,7 +47,7 @@ class TeamRun:
         :param on_placement: called with the time since the start, s, and each new answer of a robot.
         """
         self._logs, self._on_placement = logs, on_placement
-        self._radios = {name: _Radio(Team(configuration, name, "lock-step")) for name in logs}
+        self._radios = {name: _Radio(TEAM.make(configuration, TeamState(name, "lock-step"))) for name in logs}
         self.runs = {name: LockStepRun(configuration, observers={TEAM.name: self._radios[name]}) for name in logs}
         self._seconds = 0.0
 
@@ -91,10 +91,8 @@ class TeamRun:
                     self._deliver(name, radio.sent.popleft())
 
     def _deliver(self, sender: str, message: Message) -> None:
-        if isinstance(message, TeamPlacement):
-            if self._on_placement:
-                self._on_placement(self._seconds, message)
-            return
+        if isinstance(message, TeamPlacement) and self._on_placement:
+            self._on_placement(self._seconds, message)
         for name, radio in self._radios.items():
             if name != sender:
                 radio.handle(message)

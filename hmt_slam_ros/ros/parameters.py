@@ -18,7 +18,7 @@ from hmt_slam_ros.ros.guarded_node import GuardedNode
 
 # Parameters of nodes that the configuration tree does not have.
 _NODE_PARAMETERS = (
-    *("base_frame", "odom_frame", "map_frame", "laser_frame", "laser_pose"),
+    *("base_frame", "odom_frame", "map_frame", "team_frame", "laser_frame", "laser_pose"),
     "log",
     "save_to",
     "save_on_shutdown",
@@ -28,6 +28,8 @@ _NODE_PARAMETERS = (
     "recovery",
     "autostart",
     "system",
+    "robot_name",
+    "team_bandwidth",
 )
 _ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 

@@ -60,6 +60,7 @@ class ProcessNode(ParticipantNode):
     """Node of a process of the process table, with the same name.
 
     :cvar is_always_listening: whether the process also gets messages while the node is inactive.
+    :cvar team_types: classes of messages between robots, for which the node has subscriptions and writers of its own.
     :ivar save_on_shutdown: whether the map is saved before the node ends.
     :ivar process: the process, from :meth:`configure_node` on.
     :ivar reset_number: number of the last reset request that was answered, 0 before the first.
@@ -67,6 +68,7 @@ class ProcessNode(ParticipantNode):
     """
 
     is_always_listening = False
+    team_types: tuple[type, ...] = ()
     save_on_shutdown = False
 
     def __init__(self, name: str) -> None:
@@ -134,10 +136,10 @@ class ProcessNode(ParticipantNode):
         self.process = self._create_process(self.initial_state)
         if recovered is None:
             self._start_journal()
-        self.outbox = Outbox(self, self._output_types, self.reset_number)
+        self.outbox = Outbox(self, self._without_team(self._output_types), self.reset_number)
         self.inbox = Inbox(
             self,
-            SUBSCRIPTIONS[self._name],
+            self._without_team(SUBSCRIPTIONS[self._name]),
             self.deliver,
             self.diagnostics,
             first_event=self.initial_state.events,
@@ -147,6 +149,9 @@ class ProcessNode(ParticipantNode):
         )
         self._publisher_monitor = PublisherMonitor(self, self.diagnostics, self._name)
         self._participant = RequestParticipant(self, self._name) if self._name in participant_names() else None
+
+    def _without_team(self, message_types: Sequence[type]) -> list[type]:
+        return [kind for kind in message_types if kind not in self.team_types]
 
     def activate_node(self) -> None:
         """Deliver what has come, and all from now on."""

@@ -24,7 +24,8 @@ class PublisherMonitor:
         row = process_row(process)
         names = {"Keyframe": KEYFRAMES, "RealTimePose": POSE}
         names |= {kind.__name__: DOCUMENTS[kind] for kind in message_types(row.produces) if kind in DOCUMENTS}
-        self._topics = [topic for name, topic in names.items() if name in row.produces]
+        # The topics of a team have a publisher for each robot.
+        self._topics = [topic for name, topic in names.items() if name in row.produces and not topic.startswith("/")]
         if Odometry.__name__ in row.consumes:
             self._topics.append(ODOM)
         self._node, self._diagnostics = node, diagnostics

@@ -26,6 +26,7 @@ from rclpy.node import Node
 from hmt_slam_ros.configuration.documents import ros_yaml
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import Message, RealTimePose, TrackingReset
+from hmt_slam_ros.messages.team import TeamMessage
 from hmt_slam_ros.ros.journal import (
     HEADER,
     INPUT,
@@ -55,6 +56,8 @@ _MAX_JOURNAL_SIZE = 64_000_000
 """Size of a journal above which a checkpoint is due, bytes; for a robot that stands still."""
 _RESENT_MESSAGES = 64
 """Outputs that are sent again, as they may not have reached the others; more than DDS has under way at any time."""
+_NOT_RESENT = (RealTimePose, *get_args(TeamMessage))
+"""Poses by dead reckoning, and messages between robots."""
 _STATE, _PARTIAL = "state", ".partial"
 _QUARANTINE = ".quarantine"
 """Suffix of the folder with the messages that a process could not handle."""
@@ -294,8 +297,8 @@ class Recovery:
         self._append(entry)
 
     def record_output(self, message: Message) -> None:
-        """Keep an output to send it again, unless it is a pose by dead reckoning, which would be outdated."""
-        if not isinstance(message, RealTimePose):
+        """Keep an output to send it again, unless it would be outdated or is requested where it was lost."""
+        if not isinstance(message, _NOT_RESENT):
             self._recent_outputs.append(message)
 
     def add_busy_time(self, seconds: float) -> None:

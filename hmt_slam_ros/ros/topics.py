@@ -47,6 +47,8 @@ COST_HISTORY = QoSProfile(history=_KEEP_LAST, depth=100, reliability=_RELIABLE, 
 """Computing times of a node, once a second, with a row for each message."""
 LATCHED = QoSProfile(history=_KEEP_LAST, depth=1, reliability=_RELIABLE, durability=_TRANSIENT)
 """Maps, graphs and statuses: the newest message, also for late readers."""
+TEAM_HISTORY = QoSProfile(history=_KEEP_LAST, depth=64, reliability=_RELIABLE, durability=_TRANSIENT)
+"""Statuses and placements of a team; a late reader gets the newest of each robot."""
 TF_STATIC = QoSProfile(history=_KEEP_LAST, depth=100, reliability=_RELIABLE, durability=_TRANSIENT)
 """/tf_static, with one latched message from each publisher."""
 STREAM = QoSProfile(history=_KEEP_LAST, depth=100, reliability=_RELIABLE)

@@ -1,24 +1,28 @@
 """Sharing a map: items with versions, of which an update has those after a version.
 
 The definite areas of a robot, with their arcs and scans, are items. A change gives an item the next version. Who has
-all items up to a version lacks only what comes after it. So nobody remembers what was sent to whom: a robot that joins
-late, or was away, requests what is after its version, and lost, repeated and late updates do no harm.
+all items up to a version lacks only what comes after it. So nobody remembers who has what: a robot that joins late, or
+was away, requests what is after its version, and lost, repeated and late updates do no harm.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import attrgetter, xor
 from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, CommonMap, HybridMap, KeyframePoses
-from hmt_slam_ros.hybrid_map.surroundings import stack_poses
 from hmt_slam_ros.messages.map_changes import Arc
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.messages.team import SharedArea, SharedScan, TeamUpdate
+from hmt_slam_ros.messages.team import SharedArea, SharedItem, SharedScan, TeamUpdate
+from hmt_slam_ros.plain_data import to_plain
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.team.components import Component
 
@@ -28,8 +32,10 @@ NEW_KEYFRAMES = 5
 UPDATE_BYTES = 64_000
 """Size of an update above which the rest has to wait for the next one."""
 
-_SCAN_BYTES, _BEAM_BYTES, _KEYFRAME_BYTES, _ARC_BYTES = 300, 4, 40, 200
+_SCAN_BYTES, _BEAM_BYTES, _KEYFRAME_BYTES, _ARC_BYTES = 400, 6, 80, 400
 """About what a scan and a beam, and a keyframe and an arc of an area take."""
+
+_DIGEST_BYTES = 8
 
 
 class _Content(NamedTuple):
@@ -39,21 +45,54 @@ class _Content(NamedTuple):
     arcs: tuple[ArcValue, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class SharedMapState:
+    """The map that a robot shares, as a value.
+
+    :ivar version: of the newest item, 0 before the first.
+    :ivar scans: items, by growing version; ``areas`` likewise.
+    """
+
+    version: int = 0
+    scans: tuple[SharedScan, ...] = ()
+    areas: tuple[SharedArea, ...] = ()
+
+
 class SharedMap:
     """The map that a robot shares.
 
     :ivar version: of the newest item, 0 before the first.
     """
 
-    def __init__(self, robot: str, session: str) -> None:
+    def __init__(self, robot: str, session: str, state: SharedMapState | None = None) -> None:
         """:param robot: its name.
 
         :param session: of the map.
+        :param state: to go on from.
         """
-        self.robot, self.session, self.version = robot, session, 0
+        state = state or SharedMapState()
+        self.robot, self.session, self.version = robot, session, state.version
         # By growing version; a scan comes before its area.
-        self._items: OrderedDict[tuple[str, int], SharedScan | SharedArea] = OrderedDict()
+        self._items: OrderedDict[tuple[str, int], SharedItem] = OrderedDict()
         self._contents: dict[int, _Content] = {}
+        self._digests: dict[tuple[str, int], int] = {}
+        items: list[SharedItem] = [*state.scans, *state.areas]
+        for item in sorted(items, key=attrgetter("version")):
+            self._put(item, _digest(item))
+
+    @property
+    def state(self) -> SharedMapState:
+        """The shared map as a value."""
+        scans = tuple(item for item in self._items.values() if isinstance(item, SharedScan))
+        return SharedMapState(self.version, scans, self._areas())
+
+    def _areas(self) -> tuple[SharedArea, ...]:
+        return tuple(item for item in self._items.values() if isinstance(item, SharedArea))
+
+    @property
+    def digest(self) -> str:
+        """Of all items, hexadecimal."""
+        return _combine_digests(self._digests.values())
 
     def take_over(self, replica: Replica) -> bool:
         """Share what is definite in the maps of all hypotheses; whether something is new."""
@@ -61,16 +100,17 @@ class SharedMap:
         common = next(iter(replica.maps.values())).common
         arcs = _arcs_by_larger_area(common)
         occupied = set(replica.robot_areas.values())
-        for area in self._contents.keys() - common.areas.keys():
-            del self._contents[area]
-            self._add_area(area, {}, {})
+        for item in self._areas():
+            if item.area not in common.areas:
+                self._contents.pop(item.area, None)
+                self._add_area(item.area, {}, {})
         for area, keyframes in common.areas.items():
             content = _Content(keyframes, tuple(arcs.get(area, {}).values()))
             if not self._is_due(area, content, area in occupied):
                 continue
+            self._contents[area] = content
             for keyframe in keyframes:
                 self._add_scan(keyframe, replica.scans[keyframe])
-            self._contents[area] = content
             self._add_area(area, keyframes, arcs.get(area, {}))
         self._forget_scans()
         return self.version > before
@@ -86,23 +126,29 @@ class SharedMap:
     def _add_scan(self, keyframe: int, scan: Scan) -> None:
         known = self._items.get(("scan", keyframe))
         if not isinstance(known, SharedScan) or known.scan is not scan:
-            self.version += 1
-            self._put(("scan", keyframe), SharedScan(self.version, keyframe, scan))
+            self._add(SharedScan(self.version + 1, keyframe, scan))
 
     def _add_area(self, area: int, keyframes: KeyframePoses, arcs: Mapping[int, ArcValue]) -> None:
-        self.version += 1
         shared = tuple(Arc(other, area, arc.pose, arc.closure) for other, arc in arcs.items())
-        self._put(("area", area), SharedArea(self.version, area, tuple(keyframes), stack_poses(keyframes), shared))
+        self._add(SharedArea(self.version + 1, area, tuple(keyframes), tuple(keyframes.values()), shared))
 
-    def _put(self, key: tuple[str, int], item: SharedScan | SharedArea) -> None:
-        self._items[key] = item
+    def _add(self, item: SharedItem) -> None:
+        """Add an item of the next version, unless it is there with the same content."""
+        digest = _digest(item)
+        if self._digests.get(_key(item), 0) != digest:
+            self.version = item.version
+            self._put(item, digest)
+
+    def _put(self, item: SharedItem, digest: int) -> None:
+        key = _key(item)
+        self._items[key], self._digests[key] = item, digest
         self._items.move_to_end(key)
 
     def _forget_scans(self) -> None:
         """Drop scans of no area: keyframes are pruned."""
-        kept = {keyframe for content in self._contents.values() for keyframe in content.keyframes}
+        kept = {keyframe for area in self._areas() for keyframe in area.keyframes}
         for key in [key for key in self._items if key[0] == "scan" and key[1] not in kept]:
-            del self._items[key]
+            del self._items[key], self._digests[key]
 
     def update_after(self, version: int) -> TeamUpdate:
         """The items after a version, the oldest first, as many as fit into one update."""
@@ -111,7 +157,7 @@ class SharedMap:
             if item.version <= version:
                 break
             newer.append(item)
-        chosen: list[SharedScan | SharedArea] = []
+        chosen: list[SharedItem] = []
         size = 0
         while newer and (not chosen or size + _size(newer[-1]) <= UPDATE_BYTES):
             chosen.append(newer.pop())
@@ -136,10 +182,43 @@ def _is_same(one: _Content, other: _Content) -> bool:
     return all(a is b for a, b in zip(one.arcs, other.arcs, strict=True))
 
 
-def _size(item: SharedScan | SharedArea) -> int:
+def _size(item: SharedItem) -> int:
     if isinstance(item, SharedScan):
         return _SCAN_BYTES + _BEAM_BYTES * int(item.scan.ranges.size)
     return _KEYFRAME_BYTES * (1 + len(item.keyframes)) + _ARC_BYTES * len(item.arcs)
+
+
+def _key(item: SharedItem) -> tuple[str, int]:
+    return ("scan", item.keyframe) if isinstance(item, SharedScan) else ("area", item.area)
+
+
+def _digest(item: SharedItem) -> int:
+    """Digest of an item without its version; 0 for an area that was removed."""
+    if isinstance(item, SharedArea) and not item.keyframes:
+        return 0
+    content = to_plain(replace(item, version=0), {np.ndarray: lambda array: array.tobytes().hex()})
+    text = json.dumps([type(item).__name__, content], separators=(",", ":"))
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=_DIGEST_BYTES).digest(), "little")
+
+
+def _combine_digests(digests: Iterable[int]) -> str:
+    """Digest of a set of items, whatever their order."""
+    return f"{reduce(xor, digests, 0):0{2 * _DIGEST_BYTES}x}"
+
+
+@dataclass(frozen=True, eq=False)
+class ForeignMapState:
+    """The map of another robot, as a value.
+
+    :ivar session: of the map.
+    :ivar version: up to which it is known, 0 for nothing.
+    :ivar scans: of its keyframes, and those of areas that are still to come; ``areas`` likewise.
+    """
+
+    session: str
+    version: int = 0
+    scans: tuple[SharedScan, ...] = ()
+    areas: tuple[SharedArea, ...] = ()
 
 
 class ForeignMap:
@@ -149,25 +228,37 @@ class ForeignMap:
     :ivar version: up to which it is known, 0 for nothing.
     """
 
-    def __init__(self, session: str) -> None:
-        self.session, self.version = session, 0
-        self._areas: dict[int, SharedArea] = {}
-        self._scans: dict[int, Scan] = {}
+    def __init__(self, state: ForeignMapState) -> None:
+        """:param state: to go on from."""
+        self.session, self.version = state.session, state.version
+        self._areas = {area.area: area for area in state.areas}
+        self._scans = {scan.keyframe: scan for scan in state.scans}
+
+    @property
+    def state(self) -> ForeignMapState:
+        """The map as a value."""
+        return ForeignMapState(self.session, self.version, tuple(self._scans.values()), tuple(self._areas.values()))
+
+    @property
+    def digest(self) -> str:
+        """Of all items, hexadecimal."""
+        items: list[SharedItem] = [*self._scans.values(), *self._areas.values()]
+        return _combine_digests(map(_digest, items))
 
     def apply(self, update: TeamUpdate) -> bool:
         """Take in an update; whether it brought something. One that leaves a gap brings nothing."""
-        if update.session != self.session or update.after > self.version or update.version <= self.version:
+        if update.session != self.session or update.after > self.version or update.until <= self.version:
             return False
-        self._scans |= {item.keyframe: item.scan for item in update.scans if item.version > self.version}
+        self._scans |= {item.keyframe: item for item in update.scans if item.version > self.version}
         for area in update.areas:
             if area.version > self.version:
                 self._areas.pop(area.area, None)
                 if area.keyframes:
                     self._areas[area.area] = area
-        self.version = update.version
+        self.version = update.until
         if update.is_complete:
             kept = {keyframe for area in self._areas.values() for keyframe in area.keyframes}
-            self._scans = {keyframe: scan for keyframe, scan in self._scans.items() if keyframe in kept}
+            self._scans = {keyframe: item for keyframe, item in self._scans.items() if keyframe in kept}
         return True
 
     def component(self) -> Component:
@@ -175,14 +266,10 @@ class ForeignMap:
         hybrid_map = HybridMap()
         for number, area in sorted(self._areas.items()):
             if all(keyframe in self._scans for keyframe in area.keyframes):
-                hybrid_map.changed_areas[number] = dict(zip(area.keyframes, _rows(area.poses), strict=True))
+                hybrid_map.changed_areas[number] = dict(zip(area.keyframes, area.poses, strict=True))
         for area in self._areas.values():
             for arc in area.arcs:
                 if hybrid_map.has_area(arc.source) and hybrid_map.has_area(arc.target):
                     hybrid_map.changed_arcs[arc.source, arc.target] = ArcValue(arc.pose, arc.closure)
         hybrid_map.commit()
-        return Component.of_map(hybrid_map, self._scans)
-
-
-def _rows(poses: Float64) -> list[Float64]:
-    return [np.asarray(pose) for pose in poses]
+        return Component.of_map(hybrid_map, {keyframe: item.scan for keyframe, item in self._scans.items()})

@@ -2,25 +2,56 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.messages.map_changes import Pose
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message
-from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.messages.team import TeamPlacement, TeamRequest, TeamStatus, TeamUpdate, Verdict
+from hmt_slam_ros.messages.replica import Replica, ReplicaState
+from hmt_slam_ros.messages.team import (
+    MAX_TEAM_AREAS,
+    MAX_TEAM_KEYFRAMES,
+    TeamPlacement,
+    TeamRequest,
+    TeamStatus,
+    TeamUpdate,
+    Verdict,
+)
 from hmt_slam_ros.team.components import Shift, combine
 from hmt_slam_ros.team.join import Meeting, judge
 from hmt_slam_ros.team.placement_search import PlacementSearch
-from hmt_slam_ros.team.shared_map import ForeignMap, SharedMap
+from hmt_slam_ros.team.shared_map import ForeignMap, ForeignMapState, SharedMap, SharedMapState
+from hmt_slam_ros.team.team_frame import team_poses
 
 MAX_ROBOTS = 16
 """Other robots of a team: they bound the memory."""
 
-_SHIFT = Shift(2**16, 2**32)
+_SHIFT = Shift(MAX_TEAM_AREAS, MAX_TEAM_KEYFRAMES)
 """Added to the numbers of the second component of a pair, beyond those of any robot's map."""
 
 _STEPS = 8
-"""Steps of the search after a keyframe event, of 30 ms each: they bound its work."""
+"""Steps of the search after an event, of 30 ms each: they bound its work."""
+
+
+@dataclass(frozen=True, eq=False)
+class TeamState:
+    """The process of a robot in a team; searches are made again.
+
+    :ivar robot: its name in the team.
+    :ivar session: of its map: another one for each map from scratch.
+    :ivar replica: the robot's map.
+    :ivar shared: what it shares of it.
+    :ivar others: {other robot: its map}.
+    """
+
+    robot: str
+    session: str
+    replica: ReplicaState = field(default_factory=ReplicaState)
+    shared: SharedMapState = field(default_factory=SharedMapState)
+    others: Mapping[str, ForeignMapState] = field(default_factory=dict)
 
 
 class _PairState:
@@ -37,6 +68,24 @@ class _PairState:
         self.is_judged = True
 
 
+class _Other:
+    """Another robot of the team.
+
+    :ivar map: its map, as far as it is known.
+    :ivar newest: the newest version of which it is known that there is one.
+    :ivar arrived: version of the map when its last status came.
+    :ivar requested: version after which more was requested last, -1 before the first request.
+    :ivar expected: version of the own map that it has when all has arrived that was sent.
+    :ivar passed_over: version of its last request that was not answered, since that was on its way, -1 without.
+    """
+
+    def __init__(self, state: ForeignMapState) -> None:
+        self.map = ForeignMap(state)
+        self.newest = self.arrived = state.version
+        self.expected = 0
+        self.requested = self.passed_over = -1
+
+
 class Team:
     """Keeps a PMF over placements for its robot's map and each other one.
 
@@ -44,76 +93,132 @@ class Team:
     same answer. Nothing waits for another robot: what is lost is requested with its next status.
     """
 
-    def __init__(self, configuration: Configuration, robot: str, session: str) -> None:
-        """:param robot: its name in the team.
-
-        :param session: of its map: another one for each map from scratch.
-        """
-        self._configuration, self._robot = configuration, robot
-        self._replica = Replica()
-        self._shared = SharedMap(robot, session)
+    def __init__(self, configuration: Configuration, state: TeamState) -> None:
+        """:param state: to go on from."""
+        self._configuration, self._robot = configuration, state.robot
+        self._replica = Replica.from_state(state.replica)
+        self._shared = SharedMap(state.robot, state.session, state.shared)
         # The own map as the others see it.
-        self._own = ForeignMap(session)
-        self._others: dict[str, ForeignMap] = {}
-        self._pairs: dict[str, _PairState] = {}
+        self._own = ForeignMap(ForeignMapState(state.session))
+        self._others = {name: _Other(own) for name, own in state.others.items()}
+        self._pairs = {name: _PairState(configuration) for name in state.others}
+        self._placements: dict[tuple[str, str, str], TeamPlacement] = {}
+        self._update_own()
+
+    @property
+    def state(self) -> TeamState:
+        """The process as a value."""
+        others = {name: other.map.state for name, other in self._others.items()}
+        return TeamState(self._robot, self._shared.session, self._replica.state, self._shared.state, others)
 
     @property
     def status(self) -> TeamStatus:
         """What the others have to know of the map that is shared."""
-        return TeamStatus(self._robot, self._shared.session, self._shared.version)
+        return TeamStatus(self._robot, self._shared.session, self._shared.version, self._shared.digest)
+
+    @property
+    def map_poses(self) -> dict[str, Pose]:
+        """{robot: ``team_T_map``, shape (3,)} of the robots that are joined with this one, itself included."""
+        return team_poses(self._robot, self._placements.values())
 
     @property
     def meetings(self) -> dict[str, Meeting]:
         """{other robot: how the maps lie, as far as they were searched}."""
         return {name: pair.meeting for name, pair in self._pairs.items() if pair.meeting is not None}
 
+    def describe_others(self) -> dict[str, str]:
+        """{other robot: what is known of its map, and how it lies}."""
+        texts = {}
+        for name, known in sorted(self._others.items()):
+            meeting = self._pairs[name].meeting
+            verdict = "not compared" if meeting is None else meeting.verdict.value
+            texts[name] = f"version {known.map.version} of {known.newest}, {verdict}"
+        return texts
+
     def handle(self, message: Message) -> list[Message]:
-        """Process a message of the robot's own chain, or of another robot."""
+        """Process a message of the robot's own chain, or of another robot; the own status lets the search go on."""
         match message:
-            case Keyframe():
-                self._replica.add_keyframe(message)
-            case Hypotheses():
-                self._replica.apply_hypotheses(message)
+            case Keyframe() | Hypotheses():
+                self._replica.apply_message(message)
             case ClosureDecision():
                 self._replica.apply_decision(message)
                 return [*self._share(), *self.search(_STEPS)]
             case TeamStatus():
-                return self._on_status(message)
-            case TeamRequest() if (message.owner, message.session) == (self._robot, self._shared.session):
-                return [self._shared.update_after(message.version)]
+                return self.search(_STEPS) if message.robot == self._robot else self._on_status(message)
+            case TeamRequest():
+                return self._on_request(message)
             case TeamUpdate():
                 return self._on_update(message)
+            case TeamPlacement():
+                self._note_placement(message)
         return []
 
     def _share(self) -> list[Message]:
         if not self._shared.take_over(self._replica):
             return []
-        while self._own.apply(self._shared.update_after(self._own.version)):
-            pass
+        self._update_own()
         for pair in self._pairs.values():
             pair.is_outdated = True
         return [self.status]
 
+    def _update_own(self) -> None:
+        while self._own.apply(self._shared.update_after(self._own.version)):
+            pass
+
     def _on_status(self, status: TeamStatus) -> list[Message]:
-        """Request what the robot's map has more than is known here."""
+        """Request what the robot's map has more than is known here.
+
+        While a request is under way, a newer status waits for its answer. Where the same status comes again, and
+        nothing has arrived meanwhile, the answer was lost.
+        """
         name = status.robot
-        if name == self._robot or (name not in self._others and len(self._others) == MAX_ROBOTS):
+        if name not in self._others and len(self._others) == MAX_ROBOTS:
             return []
-        if name not in self._others or self._others[name].session != status.session:
-            self._others[name], self._pairs[name] = ForeignMap(status.session), _PairState(self._configuration)
-        known = self._others[name]
-        if status.version <= known.version:
+        known = self._others.get(name)
+        if known is None or known.map.session != status.session or _is_damaged(known.map, status):
+            known = self._others[name] = _Other(ForeignMapState(status.session))
+            self._pairs[name] = _PairState(self._configuration)
+        is_stuck = (known.newest, known.arrived) == (status.map_version, known.map.version)
+        known.newest, known.arrived = max(known.newest, status.map_version), known.map.version
+        if known.requested == known.map.version and not is_stuck:
             return []
-        return [TeamRequest(self._robot, name, known.session, known.version)]
+        return self._request(name, known)
+
+    def _request(self, name: str, known: _Other) -> list[Message]:
+        if known.newest <= known.map.version:
+            return []
+        known.requested = known.map.version
+        return [TeamRequest(self._robot, name, known.map.session, known.map.version)]
+
+    def _on_request(self, request: TeamRequest) -> list[Message]:
+        """The update that another robot requests, sent to all; nothing where such a one is still on its way to it."""
+        if (request.owner, request.session) != (self._robot, self._shared.session) or request.robot == self._robot:
+            return []
+        requester = self._others.get(request.robot)
+        if requester is not None and requester.passed_over != request.after < requester.expected:
+            requester.passed_over = request.after
+            return []
+        if requester is not None:
+            requester.expected = request.after
+        update = self._shared.update_after(request.after)
+        for other in self._others.values():
+            if update.after <= other.expected:
+                other.expected = max(other.expected, update.until)
+        return [update]
 
     def _on_update(self, update: TeamUpdate) -> list[Message]:
         known = self._others.get(update.robot)
-        if known is None or not known.apply(update):
+        if known is None or not known.map.apply(update):
             return []
+        known.newest = max(known.newest, update.until)
         self._pairs[update.robot].is_outdated = True
-        if update.is_complete:
-            return []
-        return [TeamRequest(self._robot, update.robot, known.session, known.version)]
+        return self._request(update.robot, known) if known.map.version < known.newest else []
+
+    def _note_placement(self, placement: TeamPlacement) -> None:
+        """Remember what a robot of the team found."""
+        names = {placement.robot, placement.first, placement.second}
+        if names <= {self._robot, *self._others}:
+            self._placements[placement.robot, placement.first, placement.second] = placement
 
     def search(self, steps: int) -> list[Message]:
         """Go on with the search for some steps; placements where the answer changed."""
@@ -135,7 +240,7 @@ class Team:
     def _update(self, name: str, pair: _PairState) -> None:
         """Let the search of a pair go on with the maps of now, if both have areas."""
         pair.is_outdated = False
-        own, other = self._own.component(), self._others[name].component()
+        own, other = self._own.component(), self._others[name].map.component()
         if own.scans and other.scans:
             first, second = (own, other) if self._robot < name else (other, own)
             pair.search.update(combine(first, second, _SHIFT))
@@ -148,7 +253,13 @@ class Team:
         now = _placement(self._robot, first, second, pair.meeting)
         if before is not None and _is_same(now, _placement(self._robot, first, second, before)):
             return []
+        self._note_placement(now)
         return [now]
+
+
+def _is_damaged(known: ForeignMap, status: TeamStatus) -> bool:
+    """Whether a map that is known up to a version differs from the robot's own at that version."""
+    return known.version == status.map_version and known.digest != status.digest
 
 
 def _placement(robot: str, first: str, second: str, meeting: Meeting) -> TeamPlacement:
