@@ -93,5 +93,5 @@ def test_maps_of_other_cells_are_refused(maps, tmp_path, capsys):
 def test_a_map_of_another_version_is_refused(maps, tmp_path, capsys):
     shutil.copytree(maps / "two", tmp_path / "two")
     manifest = tmp_path / "two" / "hmt_map" / "manifest.json"
-    manifest.write_text(manifest.read_text().replace('"version": 27', '"version": 3'))
+    manifest.write_text(manifest.read_text().replace('"version": 28', '"version": 3'))
     assert "map the log again" in fault(capsys, maps / "one", tmp_path / "two", "--out", tmp_path / "out")

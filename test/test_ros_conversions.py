@@ -73,7 +73,9 @@ def test_the_covariance_is_turned_into_the_axes_of_the_frame():
     assert np.allclose(back.covariance, belief.covariance, atol=1e-15)
 
 
-@given(st.lists(st.tuples(STAMPS, st.integers(0, 10**6), METRES, METRES, ANGLES), max_size=5), st.integers(0, 10**6))
+@given(
+    st.lists(st.tuples(STAMPS, st.integers(-(10**6), 10**6), METRES, METRES, ANGLES), max_size=5), st.integers(0, 10**6)
+)
 def test_a_trail_comes_back_bit_for_bit(rows, first):
     trail = ScanPoses(
         7,

@@ -45,7 +45,7 @@ for part in (*PARTS.values(), MapDocument, ChainState, ScanTable):
     records_of(part, RECORDS)
 
 
-FORM = (27, "c526b37ad3dd88d6")
+FORM = (28, "c10389cea1ef0d5e")
 """Version of the format, and the digest of all fields and types: a change of one is a change of both."""
 
 

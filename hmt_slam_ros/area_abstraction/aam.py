@@ -23,7 +23,14 @@ from hmt_slam_ros.area_abstraction.partition import AamState, AreaPolicy, Joined
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.hybrid_map.hybrid_map import AreaPair, HybridMap, KeyframePoses, area_pair
+from hmt_slam_ros.hybrid_map.hybrid_map import (
+    NO_KEYFRAME,
+    AreaPair,
+    HybridMap,
+    KeyframePoses,
+    area_pair,
+    has_foreign_keyframes,
+)
 from hmt_slam_ros.hybrid_map.keyframe_pruning import is_same_viewpoint, redundant_keyframes
 from hmt_slam_ros.hybrid_map.shortest_path import informative_arc
 from hmt_slam_ros.messages.map_changes import AreaMerge, PrunedKeyframe
@@ -184,7 +191,8 @@ class Aam:
             return ()
         poses = self._keyframes(hypothesis, area)
         recent = {k for k in poses if k > newest - _RECENT_EVENTS}
-        protected = recent | self._state.partitions[hypothesis].new_keyframes | set(list(poses)[:1])
+        foreign = {k for k in poses if k < NO_KEYFRAME}
+        protected = recent | foreign | self._state.partitions[hypothesis].new_keyframes | set(list(poses)[:1])
         redundant = redundant_keyframes(poses, protected, self._options.keyframes_per_place, self._filter)
         return tuple(PrunedKeyframe(k, area) for k in redundant)
 
@@ -226,6 +234,8 @@ class Aam:
             self._state = replace(self._state, merge_queue=self._state.merge_queue - {pair})
             arc = hybrid_map.arc_value(into, area)
             if arc is None or not arc.closure or exceeds_basin(arc.pose.covariance):
+                continue
+            if any(has_foreign_keyframes(hybrid_map.keyframes(side)) for side in pair):
                 continue
             joined = self._joined_graph(hypothesis, pair, arc.pose.mean)
             value = joined.min_ncut

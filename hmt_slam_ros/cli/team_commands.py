@@ -35,11 +35,12 @@ def run_team(options: argparse.Namespace) -> None:
             final, stamps, figures = finish_measured(log, results[name], configuration, wall, cpu)
             write_output(folder / name, final, stamps, figures, configuration, writers[name])
             print(summary(options.out / name, final.recording, log.duration, figures.wall_seconds))
-        robots = read_team([folder / name for name in logs])
-        components = {name: component for robot in robots for name, component in robot.components.items()}
-        team = merge_components(components, configuration)
-        write_merged(folder, robots, team, configuration)
-    print(*map(describe_meeting, team.meetings), sep="\n")
+        if not configuration.team.uses_ground:
+            robots = read_team([folder / name for name in logs])
+            components = {name: component for robot in robots for name, component in robot.components.items()}
+            team = merge_components(components, configuration)
+            write_merged(folder, robots, team, configuration)
+            print(*map(describe_meeting, team.meetings), sep="\n")
 
 
 def _checked_configuration(options: argparse.Namespace) -> Configuration:

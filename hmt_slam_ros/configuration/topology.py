@@ -184,3 +184,14 @@ class RefinementParameters:
     scan_angle: float = parameter(
         3.0, "Deviation of a scan's heading relative to its keyframe before it is registered.", 0.01, 90.0, "deg"
     )
+
+
+@dataclass(frozen=True)
+class TeamParameters:
+    """Other robots of a team."""
+
+    uses_ground: bool = parameter(
+        False,
+        "Whether the ground of robots that are joined becomes part of the map. A false join then spoils it, and in "
+        "buildings that repeat themselves there are some.",
+    )

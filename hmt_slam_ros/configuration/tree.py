@@ -25,6 +25,7 @@ from hmt_slam_ros.configuration.topology import (
     InferenceParameters,
     LoopClosureParameters,
     RefinementParameters,
+    TeamParameters,
 )
 
 
@@ -50,6 +51,7 @@ class Configuration:
     tsbi: InferenceParameters = field(default_factory=InferenceParameters)
     tlca: LoopClosureParameters = field(default_factory=LoopClosureParameters)
     refinement: RefinementParameters = field(default_factory=RefinementParameters)
+    team: TeamParameters = field(default_factory=TeamParameters)
     features: FeatureParameters = field(default_factory=FeatureParameters)
     places: PlaceParameters = field(default_factory=PlaceParameters)
     rtl: RealTimeParameters = field(default_factory=RealTimeParameters)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
@@ -22,6 +22,9 @@ AreaPair = tuple[int, int]
 
 Array = TypeVar("Array", Int32, Float64)
 
+NO_KEYFRAME = -1
+"""Stands for no keyframe. Those of other robots have smaller numbers: they are older than all of the robot's own."""
+
 _NONE = -1
 """Stands for no area or no side in arrays."""
 
@@ -35,6 +38,11 @@ _DEGREES_OF_FREEDOM = 3
 def area_pair(a: int, b: int) -> AreaPair:
     """The arc between two areas, whatever its direction."""
     return min(a, b), max(a, b)
+
+
+def has_foreign_keyframes(keyframes: Iterable[int]) -> bool:
+    """Whether other robots mapped some of these keyframes."""
+    return any(keyframe < NO_KEYFRAME for keyframe in keyframes)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -214,18 +214,21 @@ class ClosureRevision:
         }
         self.state = replace(self.state, requested_at=event, histories=histories)
         for child in hypotheses:
-            self._note_areas(child)
+            self._note_new_areas(child)
         return RevisionRequest(hypotheses, Notice("tlca", _notice_text(found, self._max_excess)))
 
     def resolve(self, hypothesis: Hypothesis, event: int) -> PathHistory | None:
         """The history of a hypothesis that follows an explanation of the last event's request; None for others."""
-        self._note_areas(hypothesis)
+        self._note_new_areas(hypothesis)
         histories = self.state.histories if event == self.state.requested_at + 1 else {}
         return histories[_explanation_key(hypothesis)] if histories else None
 
-    def _note_areas(self, hypothesis: Hypothesis) -> None:
-        areas = [area for arc in hypothesis.arcs for area in (arc.source, arc.target)]
-        self.state = replace(self.state, max_area_id=max(self.state.max_area_id, hypothesis.area, *areas))
+    def _note_new_areas(self, hypothesis: Hypothesis) -> None:
+        self.note_areas([hypothesis.area, *(area for arc in hypothesis.arcs for area in (arc.source, arc.target))])
+
+    def note_areas(self, areas: Collection[int]) -> None:
+        """Use the numbers of areas for no new one."""
+        self.state = replace(self.state, max_area_id=max([self.state.max_area_id, *areas]))
 
 
 def _as_hypothesis(explanation: Explanation, hypothesis: int, hybrid_map: HybridMap) -> Hypothesis:

@@ -27,9 +27,11 @@ from hmt_slam_ros.loop_closure.closure_history import (
 )
 from hmt_slam_ros.loop_closure.closure_revision import ClosureRevision, ClosureRevisionState, RevisionRequest
 from hmt_slam_ros.loop_closure.disambiguation import Disambiguation, probable_hypotheses
-from hmt_slam_ros.messages.map_changes import Arc, AreaPose, MovedKeyframe
+from hmt_slam_ros.loop_closure.foreign_ground import ForeignNumbers, GroundTaker, next_foreign_keyframe
+from hmt_slam_ros.messages.map_changes import Arc, AreaPose, ForeignGround, MovedKeyframe
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, Keyframe, Message, Notice
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
+from hmt_slam_ros.messages.team import JoinedGround
 
 FrameKey = tuple[int, int, int]
 
@@ -129,6 +131,8 @@ class TlcaState:
     :ivar closure_revision: what is remembered of revision requests.
     :ivar area_frames: {(hypothesis, number of the last change of its map, area): ``map_T_area``, shape (3,), or None
         if no arc joins the area with the first}, of the robot's areas under several hypotheses.
+    :ivar foreign_numbers: {other robot: numbers of its areas and keyframes in the map}.
+    :ivar waiting_ground: ground of other robots that waits for the next event with a single hypothesis, in order.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
@@ -140,6 +144,8 @@ class TlcaState:
     reported_arcs: frozenset[AreaPair] = frozenset()
     closure_revision: ClosureRevisionState = field(default_factory=ClosureRevisionState)
     area_frames: Mapping[FrameKey, Float64 | None] = field(default_factory=dict)
+    foreign_numbers: Mapping[str, ForeignNumbers] = field(default_factory=dict)
+    waiting_ground: tuple[JoinedGround, ...] = ()
 
 
 class Tlca:
@@ -186,6 +192,8 @@ class Tlca:
             poses = {estimate.hypothesis: estimate.pose.mean for estimate in message.estimates}
             poses = {**self._state.poses, **poses}
             self._state = replace(self._state, path_length=message.path_length, poses=poses)
+        elif isinstance(message, JoinedGround):
+            self._state = replace(self._state, waiting_ground=(*self._state.waiting_ground, message))
         elif isinstance(message, Hypotheses):
             return self._decide(message)
         return []
@@ -196,9 +204,10 @@ class Tlca:
         poses = {h.id: _rebase_pose(self._state.poses[h.parent], h) for h in hypotheses.hypotheses}
         self._replica.apply_hypotheses(hypotheses)
         self._state, self._new_closures = replace(self._state, paths=paths, poses=poses), frozenset()
+        ground = self._take_over_ground(hypotheses)
         definite = self._dominant_hypothesis()
         arcs, moved = ((), ()) if definite is None else self._accept_path(definite)
-        decision = ClosureDecision(hypotheses.sequence, definite, arcs, moved)
+        decision = ClosureDecision(hypotheses.sequence, definite, arcs, moved, foreign_ground=ground)
         self._replica.apply_decision(decision)
         paths = {hypothesis: self._state.paths[hypothesis] for hypothesis in self._replica.maps}
         self._state = replace(self._state, paths=paths)
@@ -211,6 +220,31 @@ class Tlca:
             return [request.notice, replace(decision, revised_hypotheses=request.hypotheses), *ambiguities]
         global_poses, notices = self._global_poses()
         return [*notices, replace(decision, global_poses=global_poses), *ambiguities]
+
+    def _take_over_ground(self, hypotheses: Hypotheses) -> ForeignGround | None:
+        """The ground that waits and becomes part of the map of the only hypothesis; its path is definite then."""
+        waiting = self._state.waiting_ground
+        if not waiting or len(hypotheses.hypotheses) > 1 or hypotheses.hypotheses[0].lost:
+            return None
+        ground, *later = waiting
+        (only,) = self._state.paths
+        path, hybrid_map = self._state.paths[only], self._replica.maps[only]
+        known = self._state.foreign_numbers.get(ground.robot)
+        if known is None or known.session != ground.session:
+            known = ForeignNumbers(ground.session)
+        largest = max(hybrid_map.max_area_id, self._closure_revision.state.max_area_id)
+        next_keyframe = next_foreign_keyframe(self._state.foreign_numbers)
+        taker = GroundTaker(hybrid_map, known, path.arc_keyframes.keys(), largest + 1, next_keyframe)
+        taken, numbers = taker.take_over(ground)
+        self._closure_revision.note_areas(numbers.areas.values())
+        path = replace(path, version=self._count_change(), is_definite=False)
+        self._state = replace(
+            self._state,
+            paths={only: path},
+            foreign_numbers={**self._state.foreign_numbers, ground.robot: numbers},
+            waiting_ground=tuple(later),
+        )
+        return taken
 
     def _changed_ambiguity(
         self, sequence: int, before: frozenset[tuple[int, bool]], poses: Mapping[int, Float64]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME
 from hmt_slam_ros.messages.ambiguity import NOT_DRIVEN, Ambiguity
 from hmt_slam_ros.messages.documents import (
     KeyframeHeader,
@@ -32,6 +33,9 @@ from hmt_slam_ros.messages.system_name import SystemName
 from hmt_slam_ros.messages.team import (
     MAX_TEAM_AREAS,
     MAX_TEAM_KEYFRAMES,
+    JoinedGround,
+    SharedArea,
+    SharedScan,
     TeamMessage,
     TeamPlacement,
     TeamUpdate,
@@ -80,7 +84,6 @@ _COUNTS = frozenset(
         "into",
         "source",
         "target",
-        "keyframe",
         "previous_area",
         "stamp",
         "version",
@@ -115,6 +118,8 @@ def check_message(message: object) -> None:
             matrices.append(value)
         elif isinstance(value, np.ndarray) and value.shape == (3,) and value.dtype == np.float64:
             _require(bool((np.abs(value) <= MAX_COORDINATE).all()), name, value.tolist(), "a pose within 1e7 m")
+        elif type(value) is int and name == "keyframe":
+            _require(value != NO_KEYFRAME, name, value, "a keyframe")
         elif type(value) is int and name in _COUNTS:
             _require(value >= 0, name, value, "0 or more")
     _check_covariances(matrices)
@@ -135,7 +140,7 @@ def _check_kind(message: object) -> None:
         _check_request_number("number", message.number)
     elif isinstance(message, SaveResponse | ResetResponse):
         _check_response(message)
-    elif isinstance(message, TeamMessage):
+    elif isinstance(message, TeamMessage | JoinedGround):
         _check_team_message(message)
 
 
@@ -267,13 +272,16 @@ def _check_response(response: SaveResponse | ResetResponse) -> None:
             _require(file.name in names and file.size >= 0, "file", file.name, "a file of that process")
 
 
-def _check_team_message(message: TeamMessage) -> None:
+def _check_team_message(message: TeamMessage | JoinedGround) -> None:
     """Check the names, and what an update or a placement holds."""
     for name in ("robot", "session", "owner", "first", "second", "digest"):
         value = getattr(message, name, "-")
         _require(bool(_TEAM_NAME.fullmatch(value)), name, value, "a name of 100 letters, digits and '_-.:+' at most")
     if isinstance(message, TeamUpdate):
-        _check_update(message)
+        for item in message.items:
+            _require(message.after < item.version <= message.until, "version", item.version, "one of the update")
+    if isinstance(message, TeamUpdate | JoinedGround):
+        _check_items(message.scans, message.areas)
     elif isinstance(message, TeamPlacement):
         _require(message.first < message.second, "second", message.second, f"a name after {message.first}")
         _require(message.robot in (message.first, message.second), "robot", message.robot, "a robot of the pair")
@@ -281,19 +289,17 @@ def _check_team_message(message: TeamMessage) -> None:
             _require(0.0 <= probability <= 1.0, "probability", probability, "between 0 and 1")
 
 
-def _check_update(update: TeamUpdate) -> None:
-    for item in update.items:
-        _require(update.after < item.version <= update.until, "version", item.version, "one of the update")
-    for scan in update.scans:
-        _require(scan.keyframe < MAX_TEAM_KEYFRAMES, "keyframe", scan.keyframe, f"below {MAX_TEAM_KEYFRAMES}")
+def _check_items(scans: Iterable[SharedScan], areas: Iterable[SharedArea]) -> None:
+    for scan in scans:
+        _require(0 <= scan.keyframe < MAX_TEAM_KEYFRAMES, "keyframe", scan.keyframe, f"0 to {MAX_TEAM_KEYFRAMES}")
         check_scan(scan.scan)
-    for area in update.areas:
+    for area in areas:
         _require(len(area.poses) == len(set(area.keyframes)), "poses", len(area.poses), "one for each keyframe")
         for arc in area.arcs:
             _require(arc.source < arc.target == area.area, "source", arc.source, "an area before that of the arc")
-        largest = max(area.area, *area.keyframes, 0)
         _require(area.area < MAX_TEAM_AREAS, "area", area.area, f"below {MAX_TEAM_AREAS}")
-        _require(largest < MAX_TEAM_KEYFRAMES, "keyframe", largest, f"below {MAX_TEAM_KEYFRAMES}")
+        for keyframe in area.keyframes:
+            _require(0 <= keyframe < MAX_TEAM_KEYFRAMES, "keyframe", keyframe, f"0 to {MAX_TEAM_KEYFRAMES}")
 
 
 def _require(holds: bool, name: str, value: object, wanted: str) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.sensors import Scan
 
 Pose = NDArray[np.float64]
 """Shape (3,): x, y, m, and heading, rad."""
@@ -133,3 +134,33 @@ class PrunedKeyframe:
 
     keyframe: int
     area: int
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ForeignKeyframe:
+    """A keyframe that another robot mapped.
+
+    :ivar keyframe: its number in the robot's map, below ``NO_KEYFRAME``.
+    :ivar area: its area there.
+    :ivar pose: shape (3,), ``area_T_base``.
+    :ivar scan: its scan.
+    """
+
+    keyframe: int
+    area: int
+    pose: Pose
+    scan: Scan
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ForeignGround:
+    """What becomes part of the robot's map of the ground of another one, with the robot's numbers.
+
+    :ivar keyframes: those that are new.
+    :ivar arcs: arcs that are new or replaced, also to areas of the robot's own ground.
+    :ivar removed_arcs: arcs that are removed.
+    """
+
+    keyframes: tuple[ForeignKeyframe, ...] = ()
+    arcs: tuple[Arc, ...] = ()
+    removed_arcs: tuple[ArcEnds, ...] = ()

@@ -22,6 +22,7 @@ from hmt_slam_ros.messages.map_changes import (
     ArcEnds,
     AreaMerge,
     AreaPose,
+    ForeignGround,
     InitialPose,
     LocalArea,
     MovedKeyframe,
@@ -30,7 +31,7 @@ from hmt_slam_ros.messages.map_changes import (
     StaleBeams,
 )
 from hmt_slam_ros.messages.tasks import GoalPose, PlaceEstimate, Task, TaskResult, VelocityCommand
-from hmt_slam_ros.messages.team import TeamMessage
+from hmt_slam_ros.messages.team import JoinedGround, TeamMessage
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import Odometry, Scan
 
@@ -204,6 +205,8 @@ class ClosureDecision:
         the closures that its explanation declares false. Else empty.
     :ivar ambiguity: shape (3, 3), second moment of the robot's pose under the other hypotheses about that under the
         most probable one: x, y along the axes of the map, m, and heading, rad; 0 for a single hypothesis.
+    :ivar foreign_ground: ground of another robot that becomes part of the map, where this is the only hypothesis; else
+        None.
     """
 
     sequence: int
@@ -213,6 +216,7 @@ class ClosureDecision:
     global_poses: tuple[AreaPose, ...] = ()
     revised_hypotheses: tuple[Hypothesis, ...] = ()
     ambiguity: NDArray[np.float64] = field(default_factory=partial(np.zeros, (3, 3)))
+    foreign_ground: ForeignGround | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -393,4 +397,5 @@ Message = (
     | VelocityCommand
     | PlaceEstimate
     | TeamMessage
+    | JoinedGround
 )

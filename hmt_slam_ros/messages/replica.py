@@ -10,7 +10,7 @@ from operator import attrgetter
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import CommonMap, GraphState, HybridMap
-from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, AreaPose, MovedKeyframe
+from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, AreaPose, ForeignGround, MovedKeyframe
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, Keyframe
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.scan import BeamRevision
@@ -160,11 +160,19 @@ class Replica:
             return
         chosen = self.maps[decision.hypothesis]
         self.apply_changes(chosen, decision.moved_keyframes, decision.arcs)
+        if decision.foreign_ground is not None:
+            self._add_foreign_ground(chosen, decision.foreign_ground)
         chosen.commit()
         self._drop_contested(chosen)
         self.maps = {decision.hypothesis: chosen}
         self.probabilities = {decision.hypothesis: 1.0}
         self.robot_areas = {decision.hypothesis: self.robot_areas[decision.hypothesis]}
+
+    def _add_foreign_ground(self, hybrid_map: HybridMap, ground: ForeignGround) -> None:
+        for new in ground.keyframes:
+            hybrid_map.set_keyframe(new.keyframe, new.area, new.pose)
+            self.scans[new.keyframe] = new.scan
+        self.apply_changes(hybrid_map, (), ground.arcs, ground.removed_arcs)
 
     def _drop_contested(self, hybrid_map: HybridMap) -> None:
         """Drop the scans that are not in the map of the remaining hypothesis."""

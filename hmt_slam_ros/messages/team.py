@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import Arc, Pose
 from hmt_slam_ros.sensors import Scan
 
@@ -136,6 +137,37 @@ class TeamPlacement:
     probability: float
     apart: float
     pose: Pose
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class JoiningArc:
+    """An arc that joins the maps of two robots.
+
+    :ivar own_area: area of the robot's own ground.
+    :ivar foreign_area: area of the other robot, in its numbers.
+    :ivar pose: belief over ``own_area_T_foreign_area``.
+    """
+
+    own_area: int
+    foreign_area: int
+    pose: PoseGaussian
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class JoinedGround:
+    """team -> tlca: ground of another robot that is joined with the robot's own, or what changed in it.
+
+    :ivar robot: name of the other robot.
+    :ivar session: of its map.
+    :ivar scans: items that are new or changed, with the numbers of the other robot; ``areas`` likewise.
+    :ivar joining_arcs: all of them; none where the join is withdrawn.
+    """
+
+    robot: str
+    session: str
+    scans: tuple[SharedScan, ...]
+    areas: tuple[SharedArea, ...]
+    joining_arcs: tuple[JoiningArc, ...]
 
 
 TeamMessage = TeamStatus | TeamRequest | TeamUpdate | TeamPlacement

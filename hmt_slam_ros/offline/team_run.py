@@ -10,7 +10,7 @@ from operator import itemgetter
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.logs.records import Log, LogRecord
 from hmt_slam_ros.messages.messages import Message
-from hmt_slam_ros.messages.team import TeamPlacement
+from hmt_slam_ros.messages.team import JoinedGround, TeamPlacement
 from hmt_slam_ros.offline.lock_step import LockStepRun, RunResult
 from hmt_slam_ros.process_table import TEAM
 from hmt_slam_ros.results.hmt_map import RunState
@@ -72,7 +72,7 @@ class TeamRun:
         self._exchange()
         while any(team.is_searching for team in self.teams.values()):
             for radio in self._radios.values():
-                radio.sent += radio.team.search(1)
+                radio.sent += radio.team.search(1, may_wait=False)
             self._exchange()
         return results
 
@@ -93,6 +93,9 @@ class TeamRun:
     def _deliver(self, sender: str, message: Message) -> None:
         if isinstance(message, TeamPlacement) and self._on_placement:
             self._on_placement(self._seconds, message)
+        if isinstance(message, JoinedGround):
+            self.runs[sender].lock_step.feed(message)
+            return
         for name, radio in self._radios.items():
             if name != sender:
                 radio.handle(message)

@@ -14,7 +14,7 @@ from hmt_slam_ros.configuration import Configuration, as_flat, as_nested
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.grids.occupancy_map import occupancy_image, write_map
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME, HybridMap, has_foreign_keyframes
 from hmt_slam_ros.hybrid_map.pose_graph import consistent_map
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
@@ -81,6 +81,8 @@ def _read_robot(path: Path, name: str) -> RobotMap:
     hybrid_map = saved.replica.maps[saved.replica.best_hypothesis]
     if not any(hybrid_map.keyframes(area) for area in hybrid_map.area_ids()):
         raise HmtSlamError(f"{path} has no keyframes to join another map by: leave it out")
+    if has_foreign_keyframes(saved.replica.scans):
+        raise HmtSlamError(f"{path} has ground of another robot: give maps that were made with team.uses_ground=false")
     whole = Component.of_map(hybrid_map, saved.replica.scans)
     return RobotMap(name, saved, split_component(name, whole))
 
@@ -152,7 +154,7 @@ def _path(
     relative: RelativeTrajectory, starts: list[int], hybrid_map: HybridMap, area_poses: dict[int, PoseGaussian]
 ) -> Trajectory:
     """``map_T_base`` of all scans, shape (n, 3), with NaN between two robots."""
-    if not (relative.keyframes >= 0).any():
+    if not (relative.keyframes != NO_KEYFRAME).any():
         return np.full(relative.poses.shape, np.nan)
     path = trajectory_in_map(relative, keyframe_poses(hybrid_map, area_poses))
     path[[start for start in starts if start < len(path)]] = np.nan

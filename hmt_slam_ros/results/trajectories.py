@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME, HybridMap
 from hmt_slam_ros.messages.messages import ScanPoses
 from hmt_slam_ros.messages.replica import FIRST_AREA
 
@@ -52,7 +52,7 @@ class RelativeTrajectory(NamedTuple):
 
         :param keyframes: {keyframe: ``map_T_base``, shape (3,)}.
         """
-        poses, known = self.poses.copy(), self.keyframes >= 0
+        poses, known = self.poses.copy(), self.keyframes != NO_KEYFRAME
         map_T_keyframe = np.array([keyframes[keyframe] for keyframe in self.keyframes[known].tolist()])
         poses[known] = se2.between(map_T_keyframe, trajectory[known])
         return RelativeTrajectory(self.keyframes, poses)
@@ -60,7 +60,7 @@ class RelativeTrajectory(NamedTuple):
     def areas(self, hybrid_map: HybridMap) -> Int64:
         """The area of each scan, shape (n,); of a scan without a pose, that of the one before it."""
         area_of = {keyframe: area for area in hybrid_map.area_ids() for keyframe in hybrid_map.keyframes(area)}
-        known = np.flatnonzero(self.keyframes >= 0)
+        known = np.flatnonzero(self.keyframes != NO_KEYFRAME)
         areas = np.array([area_of[keyframe] for keyframe in self.keyframes[known].tolist()], dtype=np.int64)
         before = np.searchsorted(known, np.arange(self.keyframes.size), side="right") - 1
         return areas[np.maximum(before, 0)]
@@ -88,11 +88,11 @@ def relative_trajectory_of(stamps: NDArray[np.int64], messages: Sequence[ScanPos
     :param messages: messages of that hypothesis and its ancestors; of two poses of a scan the later one counts.
     :raises HmtSlamError: where the messages have no scan.
     """
-    keyframes, poses = np.full(stamps.size, -1, dtype=np.int64), np.zeros((stamps.size, 3))
+    keyframes, poses = np.full(stamps.size, NO_KEYFRAME, dtype=np.int64), np.zeros((stamps.size, 3))
     for message in messages:
         rows = _rows_of_stamps(stamps, message.stamps)
         keyframes[rows], poses[rows] = message.keyframes, message.poses
-    if not (keyframes >= 0).any():
+    if not (keyframes != NO_KEYFRAME).any():
         raise HmtSlamError(f"none of the {len(poses)} scans gave a pose: check the ranges and the odometry of the log")
     return RelativeTrajectory(keyframes, poses)
 
@@ -103,7 +103,7 @@ def trajectory_in_map(scans: RelativeTrajectory, keyframes: Mapping[int, NDArray
     :param keyframes: {keyframe: ``map_T_base``, shape (3,)}.
     """
     poses = np.full(scans.poses.shape, np.nan)
-    known = scans.keyframes >= 0
+    known = scans.keyframes != NO_KEYFRAME
     map_T_keyframe = np.array([keyframes[keyframe] for keyframe in scans.keyframes[known].tolist()])
     poses[known] = se2.compose(map_T_keyframe, scans.poses[known])
     return _fill_gaps(poses)

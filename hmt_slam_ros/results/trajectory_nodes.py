@@ -18,7 +18,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.metric_slam import MotionParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import chi_square_gate, matrix_inverse, propagate_covariance
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME, HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import Edges, edge_chi2
 from hmt_slam_ros.hybrid_map.shortest_path import map_pieces, uninformative_belief
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses
@@ -54,13 +54,13 @@ class TrajectoryNodes(NamedTuple):
 
 
 def select_nodes(recording: Recording, configuration: Configuration) -> TrajectoryNodes:
-    """All keyframes, and scans of the newest log between them that are as far apart as keyframes."""
+    """All keyframes of the robot's own, and scans of the newest log between them that are as far apart as keyframes."""
     hybrid_map, relative, options = recording.hybrid_map, recording.relative_trajectory, configuration.filter
     area_of = {keyframe: area for area in hybrid_map.area_ids() for keyframe in hybrid_map.keyframes(area)}
-    ids = np.array(sorted(area_of), dtype=np.int64)
+    ids = np.array(sorted(keyframe for keyframe in area_of if keyframe > NO_KEYFRAME), dtype=np.int64)
     stamps = [recording.replica.scans[keyframe].stamp for keyframe in ids.tolist()]
     own_rows = np.searchsorted(recording.stamps, stamps)
-    is_open = (relative.keyframes >= 0) & (np.arange(len(relative.keyframes)) >= recording.first_scans[-1])
+    is_open = (relative.keyframes != NO_KEYFRAME) & (np.arange(len(relative.keyframes)) >= recording.first_scans[-1])
     angle = math.radians(options.keyframe_angle)
     rows = _spaced_rows(*_path(recording.trajectory), own_rows, is_open, options.keyframe_distance, angle)
     is_keyframe, keyframes = np.isin(rows, own_rows), relative.keyframes[rows]

@@ -52,7 +52,7 @@ _NUDGES = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (2, 0), (-2, 0), (0, 2), (0
 _SCAN_POSES_FRAME = re.compile(r"hypothesis_(\d{1,18})/scan_(\d{1,18})(?:/system_(.{1,100}))?")
 _COST_LABEL = re.compile(r"(\w{1,100})(?:/system_(.{1,100}))?")
 _AREA_FRAME = re.compile(r"area_(\d{1,18})")
-_KEYFRAME_FRAME = re.compile(r"keyframe_(\d{1,18})(?:/reset_(\d{1,19}))?(?:/system_(.{1,100}))?")
+_KEYFRAME_FRAME = re.compile(r"keyframe_(-?\d{1,18})(?:/reset_(\d{1,19}))?(?:/system_(.{1,100}))?")
 
 
 def time_message(stamp: int) -> Time:

@@ -151,6 +151,7 @@ _ANY_FLOATS = frozenset({("ScanTable", "ranges")})
 _AREA = (0, MAX_AREAS)
 _NUMBER = (0, MAX_COUNT)
 _NUMBER_OR_NONE = (-1, MAX_COUNT)
+_KEYFRAME = (-MAX_COUNT, MAX_COUNT)  # those of other robots are below -1
 _STAMP = (-MAX_STAMP, MAX_STAMP)
 _SHARE = (0.0, 1.0)
 _POSE = (-MAX_COORDINATE, MAX_COORDINATE)
@@ -170,10 +171,9 @@ _LIMITS: Mapping[str, tuple[float, float]] = {
     **dict.fromkeys(("scan_index", "dropped", "separation_count", "dominant_keyframes", "change_count"), _NUMBER),
     **dict.fromkeys(("members", "mode_count", "kidnappings"), _NUMBER),
     **dict.fromkeys(("unreported", "beams", "hypothesis", "graph", "map_sizes", "checksum"), _NUMBER),
-    **dict.fromkeys(("keyframes", "keyframe", "event", "id", "parent", "hypotheses", "since"), _NUMBER_OR_NONE),
-    **dict.fromkeys(
-        ("anchor", "published_change", "requested_at", "newest_sampled", "scans", "areas"), _NUMBER_OR_NONE
-    ),
+    **dict.fromkeys(("keyframes", "keyframe", "anchor", "second_keyframes"), _KEYFRAME),
+    **dict.fromkeys(("event", "id", "parent", "hypotheses", "since", "published_change"), _NUMBER_OR_NONE),
+    **dict.fromkeys(("requested_at", "newest_sampled", "scans", "areas"), _NUMBER_OR_NONE),
     **dict.fromkeys(("stamp", "stamps", "source_stamps", "last_stamp", "begin", "end", "clock_offset"), _STAMP),
     **dict.fromkeys(("probability", "probabilities", "unexamined", "presence", "confidence", "similarity"), _SHARE),
     **dict.fromkeys(("pose", "poses", "mean", "means", "increment", "motion", "odometry", "motions"), _POSE),

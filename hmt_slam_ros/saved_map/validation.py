@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 _SUM_ERROR = 1e-6
 """Largest difference of a sum of probabilities to 1."""
 
+_NO_KEYFRAME = -1
+
 _PATCH = 32
 """Cells along one edge of a patch of a grid."""
 
@@ -48,8 +50,8 @@ def check_record(record: Any, path: str) -> None:  # noqa: ANN401  any record of
 
 def _check_graph(graph: Any, path: str) -> None:  # noqa: ANN401
     require(int(graph.keyframe_counts.sum()) == graph.keyframes.size, f"{path}.keyframe_counts", "", "those of poses")
-    for name in ("areas", "keyframes"):
-        require(bool((getattr(graph, name) >= 0).all()), f"{path}.{name}", "negative", "0 or more")
+    require(bool((graph.areas >= 0).all()), f"{path}.areas", "negative", "0 or more")
+    require(bool((graph.keyframes != _NO_KEYFRAME).all()), f"{path}.keyframes", _NO_KEYFRAME, "keyframes")
     require(bool((graph.areas < MAX_AREAS).all()), f"{path}.areas", graph.areas.max(initial=0), f"below {MAX_AREAS}")
     require(np.unique(graph.areas).size == graph.areas.size, f"{path}.areas", "an area twice", "one of each")
     require(

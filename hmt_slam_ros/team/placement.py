@@ -53,6 +53,11 @@ _MIN_UNMAPPED = 1e-12
 """Smallest probability of unmapped ground, for logarithms."""
 
 
+def is_same_placement(one: Pose, other: Pose) -> bool:
+    """Whether two poses ``first_T_second``, shape (3,), are within 1 m and 15 degrees of each other."""
+    return PoseGaussian(one, _SAME_PLACE).mahalanobis2(PoseGaussian.from_pose(other)) <= _GATE
+
+
 class WindowCandidate(NamedTuple):
     """A pose of a window in the first component.
 

@@ -18,13 +18,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, CommonMap, HybridMap, KeyframePoses
+from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, CommonMap, HybridMap, KeyframePoses, has_foreign_keyframes
+from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
 from hmt_slam_ros.messages.map_changes import Arc
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.team import SharedArea, SharedItem, SharedScan, TeamUpdate
 from hmt_slam_ros.plain_data import to_plain
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.team.components import Component
+from hmt_slam_ros.team.own_ground import own_ground
 
 NEW_KEYFRAMES = 5
 """New keyframes of the robot's own area after which that is shared: they move while the robot maps it."""
@@ -95,9 +97,11 @@ class SharedMap:
         return _combine_digests(self._digests.values())
 
     def take_over(self, replica: Replica) -> bool:
-        """Share what is definite in the maps of all hypotheses; whether something is new."""
+        """Share what is definite in the maps of all hypotheses, and the robot's own; whether something is new."""
         before = self.version
         common = next(iter(replica.maps.values())).common
+        if any(has_foreign_keyframes(keyframes) for keyframes in common.areas.values()):
+            common = own_ground(HybridMap(common)).common
         arcs = _arcs_by_larger_area(common)
         occupied = set(replica.robot_areas.values())
         for item in self._areas():
@@ -109,9 +113,11 @@ class SharedMap:
             if not self._is_due(area, content, area in occupied):
                 continue
             self._contents[area] = content
-            for keyframe in keyframes:
+            # Keyframes that were pruned leave the definite map with the next decision.
+            kept = {keyframe: pose for keyframe, pose in keyframes.items() if keyframe in replica.scans}
+            for keyframe in kept:
                 self._add_scan(keyframe, replica.scans[keyframe])
-            self._add_area(area, keyframes, arcs.get(area, {}))
+            self._add_area(area, kept, arcs.get(area, {}))
         self._forget_scans()
         return self.version > before
 
@@ -240,6 +246,11 @@ class ForeignMap:
         return ForeignMapState(self.session, self.version, tuple(self._scans.values()), tuple(self._areas.values()))
 
     @property
+    def scan_count(self) -> int:
+        """Number of scans."""
+        return len(self._scans)
+
+    @property
     def digest(self) -> str:
         """Of all items, hexadecimal."""
         items: list[SharedItem] = [*self._scans.values(), *self._areas.values()]
@@ -261,8 +272,13 @@ class ForeignMap:
             self._scans = {keyframe: item for keyframe, item in self._scans.items() if keyframe in kept}
         return True
 
+    def items_after(self, version: int) -> tuple[tuple[SharedScan, ...], tuple[SharedArea, ...]]:
+        """The scans and areas that are newer than a version."""
+        scans = tuple(item for item in self._scans.values() if item.version > version)
+        return scans, tuple(item for item in self._areas.values() if item.version > version)
+
     def component(self) -> Component:
-        """The map as a component."""
+        """The map as a component: all that informative arcs join with its first area."""
         hybrid_map = HybridMap()
         for number, area in sorted(self._areas.items()):
             if all(keyframe in self._scans for keyframe in area.keyframes):
@@ -272,4 +288,7 @@ class ForeignMap:
                 if hybrid_map.has_area(arc.source) and hybrid_map.has_area(arc.target):
                     hybrid_map.changed_arcs[arc.source, arc.target] = ArcValue(arc.pose, arc.closure)
         hybrid_map.commit()
+        areas = hybrid_map.area_ids()
+        if areas:
+            hybrid_map = hybrid_map.subgraph(connected_areas(hybrid_map, areas[0]))
         return Component.of_map(hybrid_map, {keyframe: item.scan for keyframe, item in self._scans.items()})

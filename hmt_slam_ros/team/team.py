@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.messages.team import (
     MAX_TEAM_AREAS,
     MAX_TEAM_KEYFRAMES,
+    JoinedGround,
+    JoiningArc,
     TeamPlacement,
     TeamRequest,
     TeamStatus,
@@ -22,6 +24,7 @@ from hmt_slam_ros.messages.team import (
 )
 from hmt_slam_ros.team.components import Shift, combine
 from hmt_slam_ros.team.join import Meeting, judge
+from hmt_slam_ros.team.placement import is_same_placement
 from hmt_slam_ros.team.placement_search import PlacementSearch
 from hmt_slam_ros.team.shared_map import ForeignMap, ForeignMapState, SharedMap, SharedMapState
 from hmt_slam_ros.team.team_frame import team_poses
@@ -31,6 +34,15 @@ MAX_ROBOTS = 16
 
 _SHIFT = Shift(MAX_TEAM_AREAS, MAX_TEAM_KEYFRAMES)
 """Added to the numbers of the second component of a pair, beyond those of any robot's map."""
+
+_MIN_PROBABILITY = 0.5
+"""Probability of the best placement below which a join is withdrawn."""
+
+_CONFIRMING_KEYFRAMES = 20
+"""New keyframes of both robots with which a placement has to stay sure before it joins them: many are tried."""
+
+_MIN_GROWTH = 8
+"""New keyframes of both robots after which their maps are compared again, unless the robots stand."""
 
 _STEPS = 8
 """Steps of the search after an event, of 30 ms each: they bound its work."""
@@ -59,6 +71,10 @@ class _PairState:
 
     :ivar is_outdated: whether one of them changed since the search began or went on.
     :ivar meeting: what the search found at its end, None before.
+    :ivar keyframes: number of keyframes of both when it was compared last.
+    :ivar sure_since: number of keyframes at which the placement became sure, None where it is not.
+    :ivar joining_arcs: of the join, none without.
+    :ivar sent_version: of the other map, up to which its ground was sent to TLCA.
     """
 
     def __init__(self, configuration: Configuration) -> None:
@@ -66,6 +82,10 @@ class _PairState:
         self.is_outdated = True
         self.meeting: Meeting | None = None
         self.is_judged = True
+        self.keyframes = 0
+        self.sure_since: tuple[int, Pose] | None = None
+        self.joining_arcs: tuple[JoiningArc, ...] = ()
+        self.sent_version = 0
 
 
 class _Other:
@@ -144,7 +164,9 @@ class Team:
                 self._replica.apply_decision(message)
                 return [*self._share(), *self.search(_STEPS)]
             case TeamStatus():
-                return self.search(_STEPS) if message.robot == self._robot else self._on_status(message)
+                if message.robot == self._robot:
+                    return self.search(_STEPS, may_wait=False)
+                return self._on_status(message)
             case TeamRequest():
                 return self._on_request(message)
             case TeamUpdate():
@@ -220,12 +242,15 @@ class Team:
         if names <= {self._robot, *self._others}:
             self._placements[placement.robot, placement.first, placement.second] = placement
 
-    def search(self, steps: int) -> list[Message]:
-        """Go on with the search for some steps; placements where the answer changed."""
+    def search(self, steps: int, *, may_wait: bool = True) -> list[Message]:
+        """Go on with the search for some steps; placements where the answer changed.
+
+        :param may_wait: whether a search may wait until the maps have grown some more.
+        """
         answers: list[Message] = []
         for name, pair in sorted(self._pairs.items()):
             if pair.is_outdated:
-                self._update(name, pair)
+                self._update(name, pair, _MIN_GROWTH if may_wait else 0)
             while steps > 0 and not pair.is_judged:
                 steps -= 1
                 if not pair.search.step():
@@ -237,9 +262,12 @@ class Team:
         """Whether there is something left to search."""
         return any(pair.is_outdated or not pair.is_judged for pair in self._pairs.values())
 
-    def _update(self, name: str, pair: _PairState) -> None:
-        """Let the search of a pair go on with the maps of now, if both have areas."""
-        pair.is_outdated = False
+    def _update(self, name: str, pair: _PairState, growth: int) -> None:
+        """Let the search of a pair go on with the maps of now, if both have areas, and have grown enough."""
+        keyframes = self._own.scan_count + self._others[name].map.scan_count
+        if keyframes - pair.keyframes < growth:
+            return
+        pair.is_outdated, pair.keyframes = False, keyframes
         own, other = self._own.component(), self._others[name].map.component()
         if own.scans and other.scans:
             first, second = (own, other) if self._robot < name else (other, own)
@@ -248,13 +276,68 @@ class Team:
 
     def _judge(self, name: str, pair: _PairState) -> list[Message]:
         """The answer at the end of a search, where it differs from the one before."""
-        before, pair.meeting, pair.is_judged = pair.meeting, judge(pair.search, self._configuration), True
+        meeting = pair.meeting = judge(pair.search, self._configuration)
+        pair.is_judged = True
         first, second = sorted((self._robot, name))
-        now = _placement(self._robot, first, second, pair.meeting)
-        if before is not None and _is_same(now, _placement(self._robot, first, second, before)):
-            return []
+        if meeting.verdict is not Verdict.JOINED:
+            pair.sure_since = None
+        elif pair.joining_arcs or self._is_confirmed(pair, meeting):
+            pair.joining_arcs = _joining_arcs(meeting, is_first=self._robot == first)
+        if pair.joining_arcs and not _may_hold(meeting):
+            pair.joining_arcs, pair.sent_version = (), 0
+            withdrawn = JoinedGround(name, self._others[name].map.session, (), (), ())
+            ground: list[Message] = [withdrawn] if self._configuration.team.uses_ground else []
+        else:
+            ground = self._joined_ground(name, pair) if pair.joining_arcs else []
+        now = _placement(self._robot, first, second, meeting)
+        if meeting.verdict in (Verdict.JOINED, Verdict.OPEN):
+            now = replace(now, verdict=Verdict.JOINED if pair.joining_arcs else Verdict.OPEN)
+        before = self._placements.get((self._robot, first, second))
+        if before is not None and _is_same(now, before):
+            return ground
         self._note_placement(now)
-        return [now]
+        return [now, *ground]
+
+    @staticmethod
+    def _is_confirmed(pair: _PairState, meeting: Meeting) -> bool:
+        """Whether a placement has been sure for some keyframes, as it is now."""
+        best = meeting.distribution.best
+        assert best is not None
+        if pair.sure_since is None or not is_same_placement(pair.sure_since[1], best.pose):
+            pair.sure_since = pair.keyframes, best.pose
+        return pair.keyframes - pair.sure_since[0] >= _CONFIRMING_KEYFRAMES
+
+    def _joined_ground(self, name: str, pair: _PairState) -> list[Message]:
+        """What is new of the ground of a robot that is joined with this one."""
+        other = self._others[name].map
+        scans, areas = other.items_after(pair.sent_version)
+        if not areas or not self._configuration.team.uses_ground:
+            return []
+        pair.sent_version = other.version
+        return [JoinedGround(name, other.session, scans, areas, pair.joining_arcs)]
+
+
+def _joining_arcs(meeting: Meeting, *, is_first: bool) -> tuple[JoiningArc, ...]:
+    """The arcs of a join, from the robot's own areas.
+
+    :param is_first: whether the first component is the robot's own.
+    """
+    pair, joined = meeting.pair, meeting.joined
+    assert joined is not None
+    arcs = []
+    for known, other, arc in joined.hybrid_map.all_arcs():
+        if known in pair.known and other in pair.other:
+            number = other - pair.area_shift
+            own = JoiningArc(known, number, arc.pose) if is_first else JoiningArc(number, known, arc.pose.inverse())
+            arcs.append(own)
+    return tuple(arcs)
+
+
+def _may_hold(meeting: Meeting) -> bool:
+    """Whether a join holds: no two answers at the border of what is sure alternate."""
+    best = meeting.distribution.best
+    is_possible = meeting.verdict in (Verdict.JOINED, Verdict.OPEN)
+    return is_possible and best is not None and best.probability >= _MIN_PROBABILITY
 
 
 def _is_damaged(known: ForeignMap, status: TeamStatus) -> bool:
