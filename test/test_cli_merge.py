@@ -42,7 +42,7 @@ def test_maps_are_joined_where_they_show_the_same_ground(maps, tmp_path, capsys)
     found = re.fullmatch(r"two joins one with probability ([01]\.\d{3}), by \d+ places; apart has 0\.00\d", joined)
     assert found and float(found[1]) >= 0.99
     assert apart.startswith("elsewhere and one + two stay apart")
-    assert {"map.pgm", "map.yaml", "map.png", "topology.graphml", "merge.json", "hmt_map"} <= {
+    assert {"map.pgm", "map.yaml", "map.png", "topology.graphml", "merge.json", "team.png", "hmt_map"} <= {
         path.name for path in out.iterdir()
     }
     saved = read_saved_map(out / "hmt_map")

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hmt_slam_ros.configuration import Configuration, as_flat, as_nested
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.grids.occupancy_map import occupancy_image, write_map
 from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME, HybridMap, has_foreign_keyframes
@@ -104,7 +106,7 @@ def _scan_keys(robot: RobotMap) -> set[tuple[int, bytes]]:
 
 
 def write_merged(directory: Path, robots: Sequence[RobotMap], team: TeamMap, configuration: Configuration) -> None:
-    """Write hmt_map, map.pgm, map.yaml, map.png, topology.graphml with its tables, and merge.json.
+    """Write hmt_map, map.pgm, map.yaml, map.png, team.png, topology.graphml with its tables, and merge.json.
 
     The map has no state of a run. Pieces whose places are unknown stand beside one another.
 
@@ -123,8 +125,9 @@ def write_merged(directory: Path, robots: Sequence[RobotMap], team: TeamMap, con
     export_topology(directory)
     report = json.dumps(merge_report(robots, team, configuration), indent=1, allow_nan=False)
     (directory / MERGE_REPORT).write_text(report + "\n", encoding="utf-8")
-    from hmt_slam_ros.results.plots import draw_map  # noqa: PLC0415  matplotlib takes long to load
+    from hmt_slam_ros.results.plots import draw_map, draw_team  # noqa: PLC0415  matplotlib takes long to load
 
+    draw_team(directory, _surfaces(robots, whole, keyframe_poses(hybrid_map, area_poses)))
     draw_map(directory, read_saved_map(map_folder(directory)), _path(relative, starts, hybrid_map, area_poses))
 
 
@@ -134,6 +137,27 @@ def _write_grid(
     poses = keyframe_poses(whole.component.hybrid_map, area_poses)
     scans, settings = [whole.component.scans[keyframe] for keyframe in poses], configuration.local_map
     write_map(directory, occupancy_image(scans, np.array(list(poses.values())), settings.cell, settings.max_range))
+
+
+def _surfaces(
+    robots: Sequence[RobotMap], whole: Piece, poses: Mapping[int, NDArray[np.float64]]
+) -> dict[str, NDArray[np.float64]]:
+    """{robot: end points of its beams in the map, shape (n, 2), m}.
+
+    :param poses: {keyframe of the whole map: ``map_T_base``, shape (3,)}.
+    """
+    surfaces = {}
+    for robot in robots:
+        points = [np.zeros((0, 2))]
+        for name, component in robot.components.items():
+            shift = whole.shifts[name].keyframes
+            points += [
+                se2.transform(poses[keyframe + shift], scan.points)
+                for keyframe, scan in component.scans.items()
+                if keyframe + shift in poses
+            ]
+        surfaces[robot.name] = np.concatenate(points)
+    return surfaces
 
 
 def _trajectories(robots: Sequence[RobotMap], whole: Piece) -> tuple[RelativeTrajectory, list[int]]:

@@ -37,7 +37,7 @@ EARLIER_LOGS = "earlier"
 STAGES = "stages"
 """Folder of the trajectories before each step of the final refinement."""
 
-MERGE_REPORT = "merge.json"
+MERGE_REPORT, TEAM_PICTURE = "merge.json", "team.png"
 """File that says how a map was made of several."""
 
 OUTPUT_FILES = frozenset(
@@ -53,6 +53,7 @@ OUTPUT_FILES = frozenset(
         PLACES,
         "report.json",
         MERGE_REPORT,
+        TEAM_PICTURE,
         "pmf.csv",
         "pmf.png",
         "cost.csv",

@@ -27,6 +27,7 @@ from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.own_files import write_file
 from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
+from hmt_slam_ros.results.output_folder import TEAM_PICTURE
 from hmt_slam_ros.results.pieces import MapPiece, image_corners, split_map
 from hmt_slam_ros.results.trajectories import Trajectory
 from hmt_slam_ros.untrusted_input import MAX_TEXT_BYTES, read_text
@@ -86,6 +87,26 @@ def draw_map(directory: Path, saved: SavedMap, trajectory: Trajectory) -> Path:
     row[0].set_title(_map_title(hybrid_map, trajectory[:, :2]), fontsize=9)
     row[0].legend(loc="best", fontsize=7, framealpha=0.9)
     return _save(figure, directory / "map.png")
+
+
+def draw_team(directory: Path, surfaces: Mapping[str, NDArray[np.float64]]) -> Path:
+    """Draw team.png: what each robot saw, in its color.
+
+    :param surfaces: {name of a robot: shape (n, 2), end points of its beams in the map, m}.
+    """
+    everything = np.concatenate(list(surfaces.values()))
+    size = np.ptp(everything, axis=0) if len(everything) else np.ones(2)
+    figure = Figure(figsize=_figure_size(float(size[0]), float(size[1])), layout="constrained")
+    axes = figure.subplots()
+    for number, (name, points) in enumerate(surfaces.items()):
+        color = _color_of(number)
+        axes.plot(points[:, 0], points[:, 1], ",", color=color, alpha=0.6, rasterized=True)
+        axes.plot([], [], "s", color=color, label=name)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.legend(loc="best", fontsize=8, framealpha=0.9)
+    return _save(figure, directory / TEAM_PICTURE)
 
 
 def _draw_piece(axes: Axes, hybrid_map: HybridMap, piece: MapPiece) -> None:
