@@ -14,6 +14,7 @@ from benchmark.simulated.truth import FAR, NEAR, RADIUS, TOLERANCE, TURN
 from benchmark.simulated.worlds import LONG
 from benchmark.tail import POLICY as TAIL_POLICY
 from benchmark.tail import Pair, tail_requirement, tail_table
+from hmt_slam_ros.errors import HmtSlamError
 
 MISSED = 0.05
 """Largest share of missed loops among those that could be closed."""
@@ -133,6 +134,8 @@ def measure_topology(settings: Settings) -> Report:
     """Map the worlds, and compare the final topology with the truth."""
     records = make_records(settings, WORLDS, others=(LONG,))
     report = Report("topology", "Exact topology of nested loops", seeds=chosen_seeds(settings))
+    if not records:
+        raise HmtSlamError("topology has no world of these: name nested in --logs, or leave them out")
     inexact = [record for record in records if find_faults(record)]
     share = len(inexact) / len(records)
     report.requirements.append(Requirement("runs that do not end with the exact topology, share", share, INEXACT))

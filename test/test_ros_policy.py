@@ -22,7 +22,12 @@ POLICY = ElementTree.parse(ROOT / "config" / "sros2_policy.xml").getroot()
 QUALIFIERS = {"topics": {"publish", "subscribe"}, "services": {"request", "reply"}}
 LASER = {"laser_pose": "[0.0,0.0,0.0]"}
 PROCESSES = {name: {} for name in process_names()} | {"slam": LASER}
-COMPANIONS = {"robot": {"log": "sim:office,laps=1"}, "view": {"port": 0}, "explorer": LASER}
+COMPANIONS = {
+    "robot": {"log": "sim:office,laps=1"},
+    "view": {"port": 0},
+    "explorer": LASER,
+    "team": {"robot_name": "ann"},
+}
 """{node: its parameters}; the pilot is left out, as it does not start without a map."""
 SOMETIMES = {
     "/clock": "with use_sim_time",
