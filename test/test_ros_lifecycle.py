@@ -99,7 +99,7 @@ def test_a_malformed_document_is_reported_and_survived(listener, start):
     listener.until(
         lambda: (status := level(reported, "rtl")) and status.level == DiagnosticStatus.WARN, alive=[process]
     )
-    assert "has version 99, not 1" in level(reported, "rtl").message
+    assert "has version 99, not 2" in level(reported, "rtl").message
 
 
 def test_a_lost_message_of_the_chain_is_reported(listener, start):

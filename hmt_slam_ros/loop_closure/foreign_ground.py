@@ -20,7 +20,8 @@ class ForeignNumbers:
     """The numbers that areas and keyframes of another robot have in the map.
 
     :ivar session: of its map.
-    :ivar areas: {its number: number in the map}, ``keyframes`` likewise.
+    :ivar areas: {its number of an area: number in the map}.
+    :ivar keyframes: {its number of a keyframe: number in the map}.
     :ivar joining_arcs: arcs between its ground and the robot's own.
     """
 

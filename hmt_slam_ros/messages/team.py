@@ -159,7 +159,8 @@ class JoinedGround:
 
     :ivar robot: name of the other robot.
     :ivar session: of its map.
-    :ivar scans: items that are new or changed, with the numbers of the other robot; ``areas`` likewise.
+    :ivar scans: those that are new or changed, with the numbers of the other robot.
+    :ivar areas: likewise.
     :ivar joining_arcs: all of them; none where the join is withdrawn.
     """
 
