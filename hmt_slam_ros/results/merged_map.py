@@ -24,7 +24,7 @@ from hmt_slam_ros.messages.team import Verdict
 from hmt_slam_ros.results.export import export_topology
 from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
 from hmt_slam_ros.results.log_reading import FIXED_PARAMETERS, map_folder
-from hmt_slam_ros.results.output_folder import MERGE_REPORT, map_writer
+from hmt_slam_ros.results.output_folder import MERGE_REPORT, TEAM_PICTURE, map_writer
 from hmt_slam_ros.results.recorder import keyframe_poses
 from hmt_slam_ros.results.trajectories import RelativeTrajectory, Trajectory, trajectory_in_map
 from hmt_slam_ros.team.components import Component
@@ -127,7 +127,7 @@ def write_merged(directory: Path, robots: Sequence[RobotMap], team: TeamMap, con
     (directory / MERGE_REPORT).write_text(report + "\n", encoding="utf-8")
     from hmt_slam_ros.results.plots import draw_map, draw_team  # noqa: PLC0415  matplotlib takes long to load
 
-    draw_team(directory, _surfaces(robots, whole, keyframe_poses(hybrid_map, area_poses)))
+    draw_team(directory / TEAM_PICTURE, _surfaces(robots, whole, keyframe_poses(hybrid_map, area_poses)))
     draw_map(directory, read_saved_map(map_folder(directory)), _path(relative, starts, hybrid_map, area_poses))
 
 

@@ -27,7 +27,6 @@ from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.own_files import write_file
 from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
-from hmt_slam_ros.results.output_folder import TEAM_PICTURE
 from hmt_slam_ros.results.pieces import MapPiece, image_corners, split_map
 from hmt_slam_ros.results.trajectories import Trajectory
 from hmt_slam_ros.untrusted_input import MAX_TEXT_BYTES, read_text
@@ -89,9 +88,10 @@ def draw_map(directory: Path, saved: SavedMap, trajectory: Trajectory) -> Path:
     return _save(figure, directory / "map.png")
 
 
-def draw_team(directory: Path, surfaces: Mapping[str, NDArray[np.float64]]) -> Path:
-    """Draw team.png: what each robot saw, in its color.
+def draw_team(path: Path, surfaces: Mapping[str, NDArray[np.float64]]) -> Path:
+    """Draw what each robot saw, in its color.
 
+    :param path: of the picture.
     :param surfaces: {name of a robot: shape (n, 2), end points of its beams in the map, m}.
     """
     everything = np.concatenate(list(surfaces.values()))
@@ -106,7 +106,7 @@ def draw_team(directory: Path, surfaces: Mapping[str, NDArray[np.float64]]) -> P
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     axes.legend(loc="best", fontsize=8, framealpha=0.9)
-    return _save(figure, directory / TEAM_PICTURE)
+    return _save(figure, path)
 
 
 def _draw_piece(axes: Axes, hybrid_map: HybridMap, piece: MapPiece) -> None:
