@@ -150,6 +150,13 @@ def test_another_session_of_a_robot_is_another_map():
     assert not component(network.new, "ann").scans
 
 
+def test_a_map_of_another_session_is_joined_with_nothing():
+    team = deepcopy(office_run()[0].teams["bob"])
+    assert team.map_poses.keys() == {"ann", "bob"}
+    team.handle(TeamStatus("ann", "later", 0, "0"))
+    assert team.map_poses.keys() == {"bob"}
+
+
 def test_a_request_for_another_robot_or_session_is_not_answered():
     team = Team(CONFIGURATION, TeamState("ann", "s"))
     for request in (TeamRequest("zoe", "bob", "s", 0), TeamRequest("zoe", "ann", "earlier", 0)):

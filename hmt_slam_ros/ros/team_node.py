@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 _PERIOD = 0.1
 """Time between two transforms, and two looks at the updates that wait, s."""
-_SEARCH_PERIOD = 0.5
-"""Time after the last keyframe event or search from which the search goes on by itself, s."""
+_STANDING_TIME, _SEARCH_PERIOD = 3.0, 0.5
+"""Time after the last keyframe event from which the search goes on by itself, and time between two such steps, s."""
 _STATUS_PERIOD = 5.0
 """Time between two statuses without a change, s: so long a robot waits for what was lost."""
 _MAX_WAITING = 64
@@ -75,7 +75,7 @@ class TeamNode(ProcessNode):
         super().configure_node()
         self._waiting: deque[tuple[TeamUpdate, String]] = deque()
         self._budget, self._budget_at = self._bandwidth, time.monotonic()
-        self._searched_at = self._status_at = 0.0
+        self._event_at = self._searched_at = self._status_at = 0.0
         self._sent_bytes = 0
         self._team_publishers = {
             kind: self.create_publisher(String, DOCUMENTS[kind], profile) for kind, profile in _PROFILES.items()
@@ -104,7 +104,7 @@ class TeamNode(ProcessNode):
     def deliver(self, message: Message) -> None:
         """As any process node; a keyframe event also lets the search go on."""
         if isinstance(message, ClosureDecision):
-            self._searched_at = time.monotonic()
+            self._event_at = time.monotonic()
         super().deliver(message)
 
     def publish_views(self, message: Message, outputs: list[Message]) -> None:
@@ -126,7 +126,7 @@ class TeamNode(ProcessNode):
             if document.robot != self._robot:
                 self.diagnostics.received[kind.__name__] += 1
                 self.deliver(document)
-            elif kind is TeamStatus and document.session != self.process.status.session:
+            elif kind is TeamStatus and document.session != self.process.session:
                 raise HmtSlamError(
                     f"robot = {self._robot} is the name of another robot, too: give each a namespace or robot_name of "
                     "its own"
@@ -156,12 +156,12 @@ class TeamNode(ProcessNode):
         self._publish_transform()
         if not self.is_active:
             return
-        status = self.process.status
-        if now - self._searched_at > _SEARCH_PERIOD and self.process.is_searching:
+        is_due = now - self._event_at > _STANDING_TIME and now - self._searched_at > _SEARCH_PERIOD
+        if is_due and self.process.is_searching:
             self._searched_at = now
-            self.deliver(status)
+            self.deliver(self.process.status)
         if now - self._status_at > _STATUS_PERIOD:
-            self._publish_to_team(status)
+            self._publish_to_team(self.process.status)
 
     def _send_waiting(self, now: float) -> None:
         """Publish the updates that the bandwidth admits; one second of it may be saved."""

@@ -111,6 +111,8 @@ class Team:
 
     Of two maps, that of the robot whose name comes first is the one in which the other lies. So both robots get the
     same answer. Nothing waits for another robot: what is lost is requested with its next status.
+
+    :ivar map_poses: {robot: ``team_T_map``, shape (3,)} of the robots that are joined with this one, itself included.
     """
 
     def __init__(self, configuration: Configuration, state: TeamState) -> None:
@@ -123,6 +125,7 @@ class Team:
         self._others = {name: _Other(own) for name, own in state.others.items()}
         self._pairs = {name: _PairState(configuration) for name in state.others}
         self._placements: dict[tuple[str, str, str], TeamPlacement] = {}
+        self.map_poses = team_poses(state.robot, ())
         self._update_own()
 
     @property
@@ -137,9 +140,9 @@ class Team:
         return TeamStatus(self._robot, self._shared.session, self._shared.version, self._shared.digest)
 
     @property
-    def map_poses(self) -> dict[str, Pose]:
-        """{robot: ``team_T_map``, shape (3,)} of the robots that are joined with this one, itself included."""
-        return team_poses(self._robot, self._placements.values())
+    def session(self) -> str:
+        """Of the map that is shared."""
+        return self._shared.session
 
     @property
     def meetings(self) -> dict[str, Meeting]:
@@ -200,6 +203,7 @@ class Team:
         if known is None or known.map.session != status.session or _is_damaged(known.map, status):
             known = self._others[name] = _Other(ForeignMapState(status.session))
             self._pairs[name] = _PairState(self._configuration)
+            self._forget_placements(name)
         is_stuck = (known.newest, known.arrived) == (status.map_version, known.map.version)
         known.newest, known.arrived = max(known.newest, status.map_version), known.map.version
         if known.requested == known.map.version and not is_stuck:
@@ -241,6 +245,12 @@ class Team:
         names = {placement.robot, placement.first, placement.second}
         if names <= {self._robot, *self._others}:
             self._placements[placement.robot, placement.first, placement.second] = placement
+            self.map_poses = team_poses(self._robot, self._placements.values())
+
+    def _forget_placements(self, name: str) -> None:
+        """Forget how a map lay that is no more."""
+        self._placements = {key: each for key, each in self._placements.items() if name not in key}
+        self.map_poses = team_poses(self._robot, self._placements.values())
 
     def search(self, steps: int, *, may_wait: bool = True) -> list[Message]:
         """Go on with the search for some steps; placements where the answer changed.
