@@ -45,7 +45,7 @@ for part in (*PARTS.values(), MapDocument, ChainState, ScanTable):
     records_of(part, RECORDS)
 
 
-FORM = (28, "c10389cea1ef0d5e")
+FORM = (29, "c6a7f3b34ece70c0")
 """Version of the format, and the digest of all fields and types: a change of one is a change of both."""
 
 

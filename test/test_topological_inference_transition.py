@@ -12,7 +12,6 @@ from hmt_slam_ros.hybrid_map.shortest_path import ShortestPaths
 from hmt_slam_ros.hybrid_map.surroundings import AreaPlace, containing_area
 from hmt_slam_ros.registration.likelihood_grid import GridModel, build_area_grid
 from hmt_slam_ros.topological_inference.candidate_gating import (
-    consistent_share,
     entry_prior,
     quick_entry_bounds,
     sampled_entry_bound,
@@ -136,52 +135,6 @@ def test_new_ground_keeps_its_floor():
 
 def test_without_a_candidate_all_is_new():
     assert transition_model({}, 0.05) == ({}, 1.0)
-
-
-def seen_from(poses):
-    """What keyframes of the lower corridor saw, in the frame of the first of them."""
-    scans = [scan_in(CORRIDORS, pose, field_of_view=2 * np.pi, beams=361) for pose in poses]
-    return build_area_grid(scans, se2.between(poses[0], poses), GridModel())
-
-
-def test_of_the_poses_in_no_place_those_count_at_which_nothing_contradicts_the_map(corridor):
-    poses = keyframes(13.0)
-    query, relative = seen_from(poses), se2.between(poses[0], poses)
-    far, along, across = (
-        PoseGaussian(np.array([x, 0.0, 0.0]), np.diag(deviations) ** 2)
-        for x, deviations in ((60.0, (1.0, 1.0, 0.003)), (13.0, (0.1, 0.01, 0.003)), (13.0, (0.1, 1.0, 0.003)))
-    )
-    shares = [consistent_share(corridor, query, prior, relative, RADIUS)[0] for prior in (far, along, across)]
-    assert shares[0] == 1.0
-    # Along the corridor walls lie on walls.
-    assert shares[1] > 0.9
-    # Across it they lie in its free space.
-    assert 0.02 < shares[2] < 0.3
-
-
-def test_surfaces_of_the_map_in_free_space_of_the_keyframes_contradict_as_well(corridor):
-    """A robot that saw an empty hall is not where the map has walls, though its own walls are beyond those."""
-    hall = box(-9.0, -9.0, 9.0, 9.0)
-    query = build_area_grid(
-        [scan_in(hall, np.zeros(3), field_of_view=2 * np.pi, beams=361)], np.zeros((1, 3)), GridModel()
-    )
-    prior = PoseGaussian(np.array([14.0, 4.0, 0.0]), np.diag((0.1, 0.1, 0.003)) ** 2)
-    share, work = consistent_share(corridor, query, prior, np.zeros((1, 3)), RADIUS)
-    assert corridor.grid.compare(query.points, prior.mean).in_free_space < 10
-    assert share < 1e-5
-    assert work == 128 * (len(query.points) + len(corridor.grid.points))
-
-
-def test_without_a_pose_outside_the_places_no_share_is_taken_from_new_ground(corridor):
-    query = seen_from(keyframes(1.0))
-    assert consistent_share(corridor, query, belief(0.05), keyframes(1.0), RADIUS) == (1.0, 0)
-
-
-def test_new_ground_has_what_is_consistent_of_the_rest():
-    model = transition_model({1: 0.2, 4: 0.2}, 0.05, 0.25)
-    assert model.new == pytest.approx(0.15)
-    assert model.known == pytest.approx({1: 0.425, 4: 0.425})
-    assert transition_model({1: 0.2}, 0.05, 0.01).new == 0.05
 
 
 def test_a_place_that_the_belief_is_all_in_is_made_of_poses_as_near_as_the_belief_is_wide(corridor):

@@ -69,7 +69,6 @@ class ExaminedArea(NamedTuple):
     :ivar modes: the ways in which they lie in it.
     :ivar agreements: of their surfaces with the area's map, one for each mode.
     :ivar is_pending: whether they fit best beside its place.
-    :ivar consistent: share of the poses outside all places at which they do not contradict the map.
     """
 
     area: int
@@ -78,7 +77,6 @@ class ExaminedArea(NamedTuple):
     modes: tuple[MatchMode, ...] = ()
     agreements: tuple[Agreement, ...] = ()
     is_pending: bool = False
-    consistent: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

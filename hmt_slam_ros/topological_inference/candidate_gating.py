@@ -25,15 +25,12 @@ from hmt_slam_ros.geometry.se2 import transform_point
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import ShortestPaths, shortest_paths
 from hmt_slam_ros.hybrid_map.surroundings import (
-    NO_AREA,
     AreaPlace,
     containing_areas,
     keyframe_positions,
     min_distance,
     stack_poses,
 )
-from hmt_slam_ros.registration.consistency import MAP_IN_MAP, MAPS_OUTLIER_RATE, Agreement
-from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 
 Pose = Float64
 
@@ -45,9 +42,6 @@ _MAX_NEGATIVES = 6
 
 _DRAWS = 512
 """Draws from a belief for the probability of a place."""
-
-_CONSISTENCY_STEP = 4
-"""Of so many draws one is compared with the map."""
 
 _ROUNDING = 1e-6
 """Margin of the bounds on distances, m."""
@@ -181,17 +175,16 @@ class Transition(NamedTuple):
     new: float
 
 
-def transition_model(probabilities: Mapping[int, float], new_floor: float, consistent: float = 1.0) -> Transition:
+def transition_model(probabilities: Mapping[int, float], new_floor: float) -> Transition:
     """The transition model from the probability of each place by itself.
 
     These are computed one by one, and may sum to more than 1 where beliefs over neighboring areas disagree.
 
     :param probabilities: {area: pi}.
     :param new_floor: smallest probability of new ground: arcs may be wrong, and a place is only a model.
-    :param consistent: of :func:`consistent_share`, for the poses outside all places.
     """
     total = sum(probabilities.values())
-    new = max((1.0 - total) * consistent, new_floor)
+    new = max(1.0 - total, new_floor)
     scale = (1.0 - new) / total if total > 0.0 else 0.0
     known = {area: scale * probability for area, probability in probabilities.items()}
     return Transition(known, new if total > 0.0 else 1.0)
@@ -218,36 +211,6 @@ def entry_prior(place: AreaPlace, belief: PoseGaussian, poses: Float64, radius: 
     is_inside = containing_areas(place, _sampled_positions(belief, poses), radius) == place.area
     distances = np.sum(_normal_points()[is_inside] ** 2, axis=1)
     return EntryPrior(float(np.mean(is_inside)), float(np.median(distances)) if is_inside.any() else 0.0)
-
-
-def consistent_share(
-    place: AreaPlace, query: AreaGrid, belief: PoseGaussian, poses: Float64, radius: float
-) -> tuple[float, int]:
-    """Share of the poses in no place at which keyframes do not contradict the map, and the number of samples looked up.
-
-    They contradict it where their surfaces lie in its free space, or its surfaces in theirs; the likelihood ratio of
-    these contradictions is the weight of a pose (docs/decisions/0066-new-ground-by-the-map.md).
-
-    :param query: what the keyframes saw, in the frame of their reference.
-    :param belief: over ``area_T_reference``; ``poses`` and ``radius`` as in :func:`entry_prior`.
-    """
-    is_drawn = np.arange(_DRAWS) % _CONSISTENCY_STEP == 0
-    positions = _sampled_positions(belief, poses)[is_drawn]
-    is_outside = containing_areas(place, positions, radius) == NO_AREA
-    root, weights = np.linalg.cholesky(belief.covariance), []
-    for draw in _normal_points()[is_drawn][is_outside]:
-        pose = se2.compose(belief.mean, se2.exp(root @ draw))
-        contradictions = (
-            place.grid.compare(query.points, pose).in_free_space,
-            query.compare(place.grid.points, se2.inverse(pose)).in_free_space,
-        )
-        weights.append(math.exp(sum(map(_log_ratio_of_contradictions, contradictions))))
-    work = len(weights) * (len(query.points) + len(place.grid.points))
-    return float(np.mean(weights)) if weights else 1.0, work
-
-
-def _log_ratio_of_contradictions(count: int) -> float:
-    return MAP_IN_MAP.log_likelihood_ratio(Agreement(count, 0, count), MAPS_OUTLIER_RATE)
 
 
 def sampled_entry_bound(known: Float64, belief: PoseGaussian, poses: Float64, radius: float) -> float:

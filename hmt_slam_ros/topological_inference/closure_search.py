@@ -47,7 +47,6 @@ from hmt_slam_ros.topological_inference.candidate_gating import (
     CandidateGating,
     EntryPrior,
     Query,
-    consistent_share,
     entry_prior,
     transition_model,
 )
@@ -279,8 +278,7 @@ class ClosureSearch:
         if modes is not None:
             points = self._grid_cache.grid(candidate.unmatched_poses).points
             agreements = tuple(place.grid.compare(points, mode.pose.mean) for mode in modes)
-            consistent = self._consistent_share(place, candidate) if modes else 1.0
-            examined = examined._replace(modes=tuple(modes), agreements=agreements, consistent=consistent)
+            examined = examined._replace(modes=tuple(modes), agreements=agreements)
         candidates = {area: c for area, c in comparison.candidates.items() if area != known}
         return replace(comparison, candidates=candidates, examined=(*comparison.examined, examined), prepared=None)
 
@@ -298,8 +296,7 @@ class ClosureSearch:
         """Prior and evidence of all areas that were examined."""
         examined = [one for one in comparison.examined if one.entry.probability > 0.0]
         priors = {one.area: one.entry.probability for one in examined}
-        consistent = min((one.consistent for one in examined), default=1.0)
-        transition = transition_model(priors | dict(comparison.skipped), self._options.new_probability, consistent)
+        transition = transition_model(priors | dict(comparison.skipped), self._options.new_probability)
         newest = max(comparison.query.poses)
         if priors and newest != self._newest_sampled:
             self._newest_sampled = newest
@@ -323,12 +320,6 @@ class ClosureSearch:
 
     def _entry_probability(self, place: AreaPlace, candidate: AreaCandidate) -> EntryPrior:
         return entry_prior(place, candidate.prior, stack_poses(candidate.unmatched_poses), self._options.place_radius)
-
-    def _consistent_share(self, place: AreaPlace, candidate: AreaCandidate) -> float:
-        query, poses = self._grid_cache.grid(candidate.unmatched_poses), stack_poses(candidate.unmatched_poses)
-        share, work = consistent_share(place, query, candidate.prior, poses, self._options.place_radius)
-        self.work.add(work)
-        return share
 
     def _negative_sample(self, hybrid_map: HybridMap, area: int, excluded: Collection[int]) -> NegativeSample:
         """An area's grid, and the pose of its middle keyframe."""
