@@ -15,6 +15,7 @@ from hmt_slam_ros.offline.team_run import TeamRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.team import shared_map
 from hmt_slam_ros.team import team as team_module
+from hmt_slam_ros.team.lasting_join import JoinState, SurePlacement
 from hmt_slam_ros.team.team import MAX_ROBOTS, Team, TeamState
 
 CONFIGURATION = Configuration(seed=50)
@@ -155,6 +156,33 @@ def test_a_map_of_another_session_is_joined_with_nothing():
     assert team.map_poses.keys() == {"ann", "bob"}
     team.handle(TeamStatus("ann", "later", 0, "0"))
     assert team.map_poses.keys() == {"bob"}
+
+
+def test_a_robot_whose_process_ended_stays_joined():
+    bob = office_run()[0].teams["bob"]
+    assert bob.state.joins["ann"].joining_arcs
+    again = Team(CONFIGURATION, bob.state)
+    np.testing.assert_array_equal(again.map_poses["ann"], bob.map_poses["ann"])
+    # The search is made again, and the join does not wait for more keyframes.
+    assert again.is_searching
+    while again.is_searching:
+        placements = again.search(100, may_wait=False)
+    assert {each.verdict for each in placements} <= {Verdict.JOINED}
+    assert again.state.joins["ann"].joining_arcs
+
+
+def test_a_placement_that_is_sure_goes_on_lasting_after_the_process_ended():
+    team = Team(CONFIGURATION, replace(office_run()[0].teams["bob"].state, joins={}, placements=()))
+    while team.is_searching:
+        placements = team.search(100, may_wait=False)
+    assert [each.verdict for each in placements] == [Verdict.OPEN]
+    sure = team.state.joins["ann"].sure
+    assert sure is not None and not team.state.joins["ann"].joining_arcs
+    earlier = {"ann": JoinState(SurePlacement(sure.keyframes - 20, sure.pose))}
+    team = Team(CONFIGURATION, replace(team.state, joins=earlier, placements=()))
+    while team.is_searching:
+        placements = team.search(100, may_wait=False)
+    assert [each.verdict for each in placements] == [Verdict.JOINED]
 
 
 def test_a_request_for_another_robot_or_session_is_not_answered():

@@ -8,14 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hmt_slam_ros.configuration.tree import Configuration
-from hmt_slam_ros.messages.map_changes import Pose
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.messages.team import (
     MAX_TEAM_AREAS,
     MAX_TEAM_KEYFRAMES,
     JoinedGround,
-    JoiningArc,
     TeamPlacement,
     TeamRequest,
     TeamStatus,
@@ -24,7 +22,7 @@ from hmt_slam_ros.messages.team import (
 )
 from hmt_slam_ros.team.components import Shift, combine
 from hmt_slam_ros.team.join import Meeting, judge
-from hmt_slam_ros.team.placement import is_same_placement
+from hmt_slam_ros.team.lasting_join import JoinState, next_join
 from hmt_slam_ros.team.placement_search import PlacementSearch
 from hmt_slam_ros.team.shared_map import ForeignMap, ForeignMapState, SharedMap, SharedMapState
 from hmt_slam_ros.team.team_frame import team_poses
@@ -34,12 +32,6 @@ MAX_ROBOTS = 16
 
 _SHIFT = Shift(MAX_TEAM_AREAS, MAX_TEAM_KEYFRAMES)
 """Added to the numbers of the second component of a pair, beyond those of any robot's map."""
-
-_MIN_PROBABILITY = 0.5
-"""Probability of the best placement below which a join is withdrawn."""
-
-_CONFIRMING_KEYFRAMES = 20
-"""New keyframes of both robots with which a placement has to stay sure before it joins them: many are tried."""
 
 _MIN_GROWTH = 8
 """New keyframes of both robots after which their maps are compared again, unless the robots stand."""
@@ -57,6 +49,8 @@ class TeamState:
     :ivar replica: the robot's map.
     :ivar shared: what it shares of it.
     :ivar others: {other robot: its map}.
+    :ivar joins: {other robot: how far the join with it is}.
+    :ivar placements: what this robot and others found.
     """
 
     robot: str
@@ -64,6 +58,8 @@ class TeamState:
     replica: ReplicaState = field(default_factory=ReplicaState)
     shared: SharedMapState = field(default_factory=SharedMapState)
     others: Mapping[str, ForeignMapState] = field(default_factory=dict)
+    joins: Mapping[str, JoinState] = field(default_factory=dict)
+    placements: tuple[TeamPlacement, ...] = ()
 
 
 class _PairState:
@@ -72,20 +68,16 @@ class _PairState:
     :ivar is_outdated: whether one of them changed since the search began or went on.
     :ivar meeting: what the search found at its end, None before.
     :ivar keyframes: number of keyframes of both when it was compared last.
-    :ivar sure_since: number of keyframes at which the placement became sure, None where it is not.
-    :ivar joining_arcs: of the join, none without.
-    :ivar sent_version: of the other map, up to which its ground was sent to TLCA.
+    :ivar join: how far the join is.
     """
 
-    def __init__(self, configuration: Configuration) -> None:
+    def __init__(self, configuration: Configuration, join: JoinState) -> None:
         self.search = PlacementSearch(configuration)
         self.is_outdated = True
         self.meeting: Meeting | None = None
         self.is_judged = True
         self.keyframes = 0
-        self.sure_since: tuple[int, Pose] | None = None
-        self.joining_arcs: tuple[JoiningArc, ...] = ()
-        self.sent_version = 0
+        self.join = join
 
 
 class _Other:
@@ -123,16 +115,23 @@ class Team:
         # The own map as the others see it.
         self._own = ForeignMap(ForeignMapState(state.session))
         self._others = {name: _Other(own) for name, own in state.others.items()}
-        self._pairs = {name: _PairState(configuration) for name in state.others}
-        self._placements: dict[tuple[str, str, str], TeamPlacement] = {}
-        self.map_poses = team_poses(state.robot, ())
+        self._pairs = {name: _PairState(configuration, state.joins.get(name, JoinState())) for name in state.others}
+        self._placements = {(each.robot, each.first, each.second): each for each in state.placements}
+        self.map_poses = team_poses(state.robot, state.placements)
         self._update_own()
 
     @property
     def state(self) -> TeamState:
         """The process as a value."""
-        others = {name: other.map.state for name, other in self._others.items()}
-        return TeamState(self._robot, self._shared.session, self._replica.state, self._shared.state, others)
+        return TeamState(
+            self._robot,
+            self._shared.session,
+            self._replica.state,
+            self._shared.state,
+            {name: other.map.state for name, other in self._others.items()},
+            {name: pair.join for name, pair in self._pairs.items()},
+            tuple(self._placements.values()),
+        )
 
     @property
     def status(self) -> TeamStatus:
@@ -202,7 +201,7 @@ class Team:
         known = self._others.get(name)
         if known is None or known.map.session != status.session or _is_damaged(known.map, status):
             known = self._others[name] = _Other(ForeignMapState(status.session))
-            self._pairs[name] = _PairState(self._configuration)
+            self._pairs[name] = _PairState(self._configuration, JoinState())
             self._forget_placements(name)
         is_stuck = (known.newest, known.arrived) == (status.map_version, known.map.version)
         known.newest, known.arrived = max(known.newest, status.map_version), known.map.version
@@ -289,65 +288,30 @@ class Team:
         meeting = pair.meeting = judge(pair.search, self._configuration)
         pair.is_judged = True
         first, second = sorted((self._robot, name))
-        if meeting.verdict is not Verdict.JOINED:
-            pair.sure_since = None
-        elif pair.joining_arcs or self._is_confirmed(pair, meeting):
-            pair.joining_arcs = _joining_arcs(meeting, is_first=self._robot == first)
-        if pair.joining_arcs and not _may_hold(meeting):
-            pair.joining_arcs, pair.sent_version = (), 0
-            withdrawn = JoinedGround(name, self._others[name].map.session, (), (), ())
-            ground: list[Message] = [withdrawn] if self._configuration.team.uses_ground else []
-        else:
-            ground = self._joined_ground(name, pair) if pair.joining_arcs else []
+        before = pair.join
+        pair.join = next_join(before, meeting, pair.keyframes, is_first=self._robot == first)
+        ground = self._joined_ground(name, pair, before)
         now = _placement(self._robot, first, second, meeting)
         if meeting.verdict in (Verdict.JOINED, Verdict.OPEN):
-            now = replace(now, verdict=Verdict.JOINED if pair.joining_arcs else Verdict.OPEN)
-        before = self._placements.get((self._robot, first, second))
-        if before is not None and _is_same(now, before):
+            now = replace(now, verdict=Verdict.JOINED if pair.join.joining_arcs else Verdict.OPEN)
+        earlier = self._placements.get((self._robot, first, second))
+        if earlier is not None and _is_same(now, earlier):
             return ground
         self._note_placement(now)
         return [now, *ground]
 
-    @staticmethod
-    def _is_confirmed(pair: _PairState, meeting: Meeting) -> bool:
-        """Whether a placement has been sure for some keyframes, as it is now."""
-        best = meeting.distribution.best
-        assert best is not None
-        if pair.sure_since is None or not is_same_placement(pair.sure_since[1], best.pose):
-            pair.sure_since = pair.keyframes, best.pose
-        return pair.keyframes - pair.sure_since[0] >= _CONFIRMING_KEYFRAMES
-
-    def _joined_ground(self, name: str, pair: _PairState) -> list[Message]:
-        """What is new of the ground of a robot that is joined with this one."""
-        other = self._others[name].map
-        scans, areas = other.items_after(pair.sent_version)
-        if not areas or not self._configuration.team.uses_ground:
+    def _joined_ground(self, name: str, pair: _PairState, before: JoinState) -> list[Message]:
+        """What is new of the ground of a robot that is joined with this one; none of it where the join is withdrawn."""
+        other, join = self._others[name].map, pair.join
+        if not self._configuration.team.uses_ground:
             return []
-        pair.sent_version = other.version
-        return [JoinedGround(name, other.session, scans, areas, pair.joining_arcs)]
-
-
-def _joining_arcs(meeting: Meeting, *, is_first: bool) -> tuple[JoiningArc, ...]:
-    """The arcs of a join, from the robot's own areas.
-
-    :param is_first: whether the first component is the robot's own.
-    """
-    pair, joined = meeting.pair, meeting.joined
-    assert joined is not None
-    arcs = []
-    for known, other, arc in joined.hybrid_map.all_arcs():
-        if known in pair.known and other in pair.other:
-            number = other - pair.area_shift
-            own = JoiningArc(known, number, arc.pose) if is_first else JoiningArc(number, known, arc.pose.inverse())
-            arcs.append(own)
-    return tuple(arcs)
-
-
-def _may_hold(meeting: Meeting) -> bool:
-    """Whether a join holds: no two answers at the border of what is sure alternate."""
-    best = meeting.distribution.best
-    is_possible = meeting.verdict in (Verdict.JOINED, Verdict.OPEN)
-    return is_possible and best is not None and best.probability >= _MIN_PROBABILITY
+        if not join.joining_arcs:
+            return [JoinedGround(name, other.session, (), (), ())] if before.joining_arcs else []
+        scans, areas = other.items_after(join.sent_version)
+        if not areas:
+            return []
+        pair.join = replace(join, sent_version=other.version)
+        return [JoinedGround(name, other.session, scans, areas, join.joining_arcs)]
 
 
 def _is_damaged(known: ForeignMap, status: TeamStatus) -> bool:
