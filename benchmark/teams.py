@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import combinations, pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,10 +26,14 @@ from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.evaluation import StampedPoses, read_true_poses, read_tum
 from hmt_slam_ros.logs.records import Log
+from hmt_slam_ros.messages.documents import encode
+from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.team import TeamPlacement, Verdict
+from hmt_slam_ros.offline.lock_step import RunResult
 from hmt_slam_ros.offline.team_run import TeamRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.team.team import Team
 
 RECORDED = ("aces", "intel", "csail", "hospital")
 WORLDS = ("office", "busy", "nested", "grid", "ring", "straight", "hall", "twins")
@@ -67,7 +73,9 @@ class PairOutcome:
     :ivar false_joins: answers that joined them wrongly.
     :ivar path: until the first right join, m; inf without.
     :ivar answers: (probability of the best placement, whether it is right) of all answers.
-    :ivar share: computing time of both processes, as a share of the duration.
+    :ivar share: computing time of a robot's process, as a share of its duration.
+    :ivar sent: by one of them, as documents, bytes per meter of its path.
+    :ivar keyframes: number of those of its own ground that a robot has at the end, on average.
     """
 
     family: str
@@ -78,6 +86,8 @@ class PairOutcome:
     path: float
     answers: tuple[tuple[float, bool], ...]
     share: float
+    sent: float
+    keyframes: float
 
     @property
     def is_due(self) -> bool:
@@ -138,17 +148,41 @@ def _drive_at_once(changes: Sequence[str], drive: _TeamDrive) -> list[PairOutcom
             is_right = best is not None and are_right(window_errors(meeting, best, truth, truth))
             answers.append((seconds, placement, is_right))
 
-    run = TeamRun(configuration, logs, note)
+    sent: Counter[str] = Counter()
+    run = TeamRun(configuration, logs, note, lambda robot, message: sent.update({robot: len(encode(message))}))
     results = run.run()
-    costs = {name: float(result.seconds_per_scan["team"].sum()) for name, result in results.items()}
     tracks = {name: _Track.of_log(log, truth) for name, log in logs.items()}
+    costs = {
+        name: _Cost.of_robot(result, tracks[name], sent[name], _own_keyframes(run.teams[name]))
+        for name, result in results.items()
+    }
     outcomes = []
     for first, second in combinations(logs, 2):
         own = [each for each in answers if (each[1].first, each[1].second) == (first, second)]
-        share = (costs[first] + costs[second]) / max(tracks[first].seconds[-1], tracks[second].seconds[-1])
-        name = f"{drive.name}, {first} and {second}"
-        outcomes.append(_outcome(drive.family, name, tracks[first], tracks[second], own, share))
+        name, cost = f"{drive.name}, {first} and {second}", _Cost.of_both(costs[first], costs[second])
+        outcomes.append(_outcome(drive.family, name, tracks[first], tracks[second], own, cost))
     return outcomes
+
+
+class _Cost(NamedTuple):
+    """What a robot of a team computes, sends and stores: see :class:`PairOutcome`."""
+
+    share: float
+    sent: float
+    keyframes: float
+
+    @classmethod
+    def of_robot(cls, result: RunResult, track: _Track, sent: int, keyframes: int) -> _Cost:
+        computed = float(result.seconds_per_scan["team"].sum())
+        return cls(computed / float(track.seconds[-1]), sent / float(track.lengths[-1]), keyframes)
+
+    @classmethod
+    def of_both(cls, one: _Cost, other: _Cost) -> _Cost:
+        return cls(*(0.5 * (a + b) for a, b in zip(one, other, strict=True)))
+
+
+def _own_keyframes(team: Team) -> int:
+    return sum(keyframe >= 0 for keyframe in Replica.from_state(team.state.replica).scans)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +228,7 @@ def _outcome(
     first: _Track,
     second: _Track,
     answers: Sequence[tuple[float, TeamPlacement, bool]],
-    share: float,
+    cost: _Cost,
 ) -> PairOutcome:
     common: Bool = distances_between(first.positions, second.positions) <= COMMON
     overlap = first.length_where(np.any(common, axis=1)) + second.length_where(np.any(common, axis=0))
@@ -213,7 +247,7 @@ def _outcome(
         sum(not right for _, right in joins),
         path,
         tuple((placement.probability, right) for _, placement, right in answers if placement.probability > 0.0),
-        share,
+        *cost,
     )
 
 
@@ -230,6 +264,7 @@ def requirements(found: Sequence[PairOutcome]) -> list[Requirement]:
         Requirement("due and joined, share", mean([pair.is_joined for pair in due]), math.inf, least=0.95),
         Requirement("path until the join, median", paths[len(paths) // 2] if paths else math.nan, 10.0, "m"),
         Requirement("in 90 %", paths[int(0.9 * len(paths))] if paths else math.nan, 25.0, "m"),
+        Requirement("sent by a robot, most", max((1e-3 * pair.sent for pair in found), default=0.0), 10.0, "kB/m"),
         tail.tail_requirement("best placements", _answers(found)),
     ]
 
@@ -249,7 +284,9 @@ def team_table(found: Sequence[PairOutcome]) -> str:
         ("others joined", lambda row: str(sum(not pair.is_due and pair.is_joined for pair in row[1]))),
         ("joined wrongly", lambda row: str(sum(pair.false_joins > 0 for pair in row[1]))),
         ("path until joined, median", lambda row: _median_path(row[1])),
-        ("computing time of a robot", lambda row: f"{50.0 * mean([pair.share for pair in row[1]]):.1f} %"),
+        ("computing time of a robot", lambda row: f"{100.0 * mean([pair.share for pair in row[1]]):.1f} %"),
+        ("sent by a robot", lambda row: f"{1e-3 * mean([pair.sent for pair in row[1]]):.1f} kB/m"),
+        ("own keyframes of a robot", lambda row: f"{mean([pair.keyframes for pair in row[1]]):.0f}"),
     ]
     return table_of(columns, list(groups.items()))
 

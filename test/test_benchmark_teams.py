@@ -25,7 +25,7 @@ def answer(seconds, verdict, probability, is_right):
 
 
 def outcome(first, second, *answers):
-    return teams._outcome("hall", "hall-1", first, second, answers, 0.1)
+    return teams._outcome("hall", "hall-1", first, second, answers, teams._Cost(0.05, 2000.0, 40.0))
 
 
 def test_overlap_is_the_path_on_ground_of_the_other():
@@ -59,7 +59,9 @@ def test_a_wrong_join_counts_though_it_is_withdrawn():
 
 def pair(**changes):
     values = {"family": "hall", "name": "hall-1", "overlap": 50.0, "is_joined": True, "false_joins": 0, "path": 8.0}
-    return PairOutcome(**values | {"answers": ((0.995, True),), "share": 0.1} | changes)
+    return PairOutcome(
+        **values | {"answers": ((0.995, True),), "share": 0.05, "sent": 2000.0, "keyframes": 40.0} | changes
+    )
 
 
 def test_requirements_and_table():
@@ -69,7 +71,8 @@ def test_requirements_and_table():
     assert bounds["due and joined, share"].value == pytest.approx(18 / 19)
     assert not bounds["due and joined, share"].is_met
     assert bounds["path until the join, median"].value == 8.0
-    assert "| hall | 20 | 48 m | 19 | 18 | 0 | 0 | 8.0 m | 5.0 % |" in team_table(found)
+    assert bounds["sent by a robot, most"].value == 2.0
+    assert "| hall | 20 | 48 m | 19 | 18 | 0 | 0 | 8.0 m | 5.0 % | 2.0 kB/m | 40 |" in team_table(found)
 
 
 @pytest.mark.parametrize("verdict", ["joined", "open"])

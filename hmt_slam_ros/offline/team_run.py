@@ -41,12 +41,14 @@ class TeamRun:
         configuration: Configuration,
         logs: Mapping[str, Log],
         on_placement: Callable[[float, TeamPlacement], None] | None = None,
+        on_sent: Callable[[str, Message], None] | None = None,
     ) -> None:
         """:param logs: {name of a robot: its log}.
 
         :param on_placement: called with the time since the start, s, and each new answer of a robot.
+        :param on_sent: called with the name of a robot and each message that it sends to the others.
         """
-        self._logs, self._on_placement = logs, on_placement
+        self._logs, self._on_placement, self._on_sent = logs, on_placement, on_sent
         self._radios = {name: _Radio(TEAM.make(configuration, TeamState(name, "lock-step"))) for name in logs}
         self.runs = {name: LockStepRun(configuration, observers={TEAM.name: self._radios[name]}) for name in logs}
         self._seconds = 0.0
@@ -96,6 +98,8 @@ class TeamRun:
         if isinstance(message, JoinedGround):
             self.runs[sender].lock_step.feed(message)
             return
+        if self._on_sent:
+            self._on_sent(sender, message)
         for name, radio in self._radios.items():
             if name != sender:
                 radio.handle(message)
