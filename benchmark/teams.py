@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
-from itertools import combinations, pairwise
+from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -52,11 +53,11 @@ _STEP = 0.2
 """Distance of the positions between which ground is common, m."""
 
 POLICY = (
-    "The parts of a drive are driven at once, by a robot each, in lock-step. A recorded log is cut in two, two "
-    "laps of a simulated drive into parts of equal time. *Overlap* is the path of both robots of a pair on ground "
-    f"where the other has been before, or was later; from {MIN_OVERLAP:g} m on a join is due. A join is right if "
-    "most of its windows are within 1 m and 15 degrees of the truth: the true pose of the simulation, or the run "
-    "over the whole log. The path until the join is that of the robots of a pair, on average, since the first of "
+    "All robots of a team drive at once, in lock-step. A recorded log is cut in two. In a simulated world each robot "
+    "drives one lap of the same route; they begin equally far apart on it. *Overlap* is the path of both robots of a "
+    f"pair on ground where the other has been before, or was later; from {MIN_OVERLAP:g} m on a join is due. A join is "
+    "right if most of its windows are within 1 m and 15 degrees of the truth: the true pose of the simulation, or the "
+    "run over the whole log. The path until the join is that of the robots of a pair, on average, since the first of "
     "them was on the other's ground. Answers are those of the first robot of a pair; one counts where the third "
     "digit of its probability is new."
 )
@@ -97,12 +98,12 @@ class PairOutcome:
 
 @dataclass(frozen=True)
 class _TeamDrive:
-    """A drive, the shares of time at which it is cut, and the truth if it is not that of the log."""
+    """A drive, the parts of it that robots drive, as shares of its time, and the truth if it is not that of the log."""
 
     family: str
     name: str
     path: Path | str
-    cuts: tuple[float, ...]
+    parts: tuple[tuple[float, float], ...]
     truth: StampedPoses | None
 
 
@@ -115,12 +116,14 @@ def measure_team(settings: Settings) -> Report:
         for log in logs:
             whole = settings.runner.runs([Case(log, 0, changes=settings.changes)])[0]
             truth = read_tum(whole.folder / "trajectory.tum")
-            drives += [_TeamDrive(log.name, f"{log.name} at {cut:g}", log.path, (cut,), truth) for cut in CUTS]
+            drives += [
+                _TeamDrive(log.name, f"{log.name} at {cut:g}", log.path, ((0.0, cut), (cut, 1.0)), truth)
+                for cut in CUTS
+            ]
         for family in (name for name in names if name in FAMILIES):
             for n, seed in enumerate(seeds):
                 size, world = SIZES[n % len(SIZES)], World(family, seed)
-                cuts = tuple(k / size for k in range(1, size))
-                drives.append(_TeamDrive(family, f"{world.name}, {size} robots", world.log, cuts, None))
+                drives.append(_TeamDrive(family, f"{world.name}, {size} robots", *_laps(world, size), None))
         with ProcessPoolExecutor(settings.runner.jobs, multiprocessing.get_context("spawn")) as pool:
             found = [pair for pairs in pool.map(partial(_drive_at_once, settings.changes), drives) for pair in pairs]
     report.requirements = requirements(found)
@@ -129,14 +132,19 @@ def measure_team(settings: Settings) -> Report:
     return report
 
 
+def _laps(world: World, size: int) -> tuple[str, tuple[tuple[float, float], ...]]:
+    """Two laps of a world, and the lap of each of so many robots: all begin equally far apart."""
+    name = re.sub(",laps=[0-9]+", "", world.log) + ",laps=2"
+    return name, tuple((0.5 * n / size, 0.5 * n / size + 0.5) for n in range(size))
+
+
 def _drive_at_once(changes: Sequence[str], drive: _TeamDrive) -> list[PairOutcome]:
     """Run a team over the parts of a drive."""
     configuration = load_configuration(PARAMETERS, list(changes))
     whole = open_log(drive.path)
-    ends = (0.0, *drive.cuts, 1.0)
     logs = {
         f"robot {n}": open_log(drive.path, start=a * whole.duration, duration=(b - a) * whole.duration)
-        for n, (a, b) in enumerate(pairwise(ends), 1)
+        for n, (a, b) in enumerate(drive.parts, 1)
     }
     truth = drive.truth or read_true_poses(whole)
     answers: list[tuple[float, TeamPlacement, bool]] = []

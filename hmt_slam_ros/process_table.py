@@ -213,7 +213,7 @@ DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow(f"{_TEAM}:JoinedGround", "hmt/joined_ground", "joined_ground", 1),
     DocumentRow(f"{_TEAM}:TeamStatus", "/team/statuses", "team_status", 1),
     DocumentRow(f"{_TEAM}:TeamRequest", "/team/requests", "team_request", 1),
-    DocumentRow(f"{_TEAM}:TeamUpdate", "/team/updates", "team_update", 1),
+    DocumentRow(f"{_TEAM}:TeamUpdate", "/team/updates", "team_update", 2),
     DocumentRow(f"{_TEAM}:TeamPlacement", "/team/placements", "team_placement", 1),
 )
 """Messages that travel as JSON documents."""

@@ -20,6 +20,7 @@ from hmt_slam_ros.messages.messages import Keyframe
 from hmt_slam_ros.messages.team import SharedArea, TeamPlacement, TeamRequest, TeamStatus, TeamUpdate, Verdict
 from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import keyframe_frame, scan_message
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAME_SCANS, KEYFRAMES
@@ -161,7 +162,9 @@ def test_robots_of_one_building_find_one_another_and_a_third_stays_apart(team, t
         robot.play(messages[: 3 * len(messages) // 4])
     team.until(lambda: team.is_sure(ann, bob) and team.is_sure(bob, ann))
     # It has to stay so for some keyframes.
-    assert team.verdict(ann, bob) == team.verdict(bob, ann) == Verdict.OPEN
+    sure = [each for each in team.messages(TeamPlacement) if each.probability > 0.99]
+    for robot in ("ann", "bob"):
+        assert next(each for each in sure if each.robot == robot).verdict is Verdict.OPEN
     for robot, messages in chains.items():
         robot.play(messages[3 * len(messages) // 4 :])
     team.until(lambda: team.verdict(ann, bob) == team.verdict(bob, ann) == Verdict.JOINED)
@@ -189,6 +192,7 @@ def test_robots_of_one_building_find_one_another_and_a_third_stays_apart(team, t
     team.until(lambda: len(bob.transforms) > transforms and bob.values.get("joined with") == "ann")
     assert {status.session for status in team.messages(TeamStatus) if status.robot == "bob"} == session
     assert len(team.messages(TeamUpdate)) == sent
+    assert team.verdict(bob, ann) is Verdict.JOINED
 
 
 def test_what_is_no_message_of_a_team_is_refused_by_name(team, listener):
@@ -197,12 +201,16 @@ def test_what_is_no_message_of_a_team_is_refused_by_name(team, listener):
     publishers = {
         kind: listener.node.create_publisher(String, DOCUMENTS[kind], topics.TEAM_HISTORY) for kind in team.sent
     }
-    empty = TeamUpdate("ann", "1", 0, 1, (), (), True)
+    empty = TeamUpdate("ann", "1", 0, 1, (), (), True, NO_CLUTTER)
     area = SharedArea(1, 0, (0, 0), (np.zeros(3), np.zeros(3)), ())
     strange = {
         TeamStatus: [encode(TeamStatus("bob", "another", 1, "0")), "{}", encode(TeamStatus("", "1", 1, "0"))],
         TeamRequest: [encode(TeamRequest("ann", "bob", "1", 0)).replace('"version":1', '"version":7')],
-        TeamUpdate: [encode(replace(empty, areas=(area,))), encode(replace(empty, areas=(replace(area, version=9),)))],
+        TeamUpdate: [
+            encode(replace(empty, clutter=Clutter(1.5, 0.0))),
+            encode(replace(empty, areas=(area,))),
+            encode(replace(empty, areas=(replace(area, version=9),))),
+        ],
         TeamPlacement: [encode(TeamPlacement("ann", "bob", "ann", Verdict.JOINED, 1.0, 0.0, np.zeros(3)))],
     }
     for kind, documents in strange.items():

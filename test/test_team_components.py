@@ -1,11 +1,15 @@
 """Two maps as one hybrid map, and the windows of a component."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from worlds import blank_scan
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative, map_pieces
+from hmt_slam_ros.registration.consistency import MAPS_OUTLIER_RATE, Clutter
 from hmt_slam_ros.team.components import Component, combine, renumber
 from hmt_slam_ros.team.team_map import split_component
 from hmt_slam_ros.team.windows import find_windows
@@ -41,6 +45,17 @@ def test_nothing_is_known_of_the_arc_between_two_components():
     assert map_pieces(pair.hybrid_map) == [[0, 1], [2, 3]]
     # Beside, as long as the place is unknown.
     assert pair.hybrid_map.arc(*pair.joint).mean[0] > 20.0
+
+
+def test_people_who_walked_past_either_robot_contradict_between_the_maps():
+    busy, calm = Clutter(0.03, 0.004), Clutter(0.0005, 0.001)
+    pair = combine(replace(corridor(), clutter=busy), replace(corridor(), clutter=calm))
+    assert pair.clutter == pytest.approx((0.03, 0.0025))
+    both = combine(replace(corridor(), clutter=busy), replace(corridor(), clutter=busy))
+    assert both.clutter.beam_outlier_rate == pytest.approx(2 * 0.03 - MAPS_OUTLIER_RATE)
+    # Maps without people contradict as maps do.
+    assert combine(corridor(), corridor()).clutter == pytest.approx((MAPS_OUTLIER_RATE, 0.0))
+    assert pair.as_one(pair.hybrid_map).clutter == busy
 
 
 def test_the_components_stay_as_they_are():

@@ -13,6 +13,7 @@ from hmt_slam_ros.messages.team import TeamPlacement, TeamRequest, TeamStatus, T
 from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.offline.team_run import TeamRun
 from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.registration.consistency import NO_CLUTTER
 from hmt_slam_ros.team import shared_map
 from hmt_slam_ros.team import team as team_module
 from hmt_slam_ros.team.lasting_join import JoinState, SurePlacement
@@ -78,6 +79,14 @@ def test_robots_of_two_buildings_stay_apart():
     assert {each.verdict for each in placements} <= {Verdict.APART, Verdict.OPEN}
 
 
+def test_robots_among_people_are_joined():
+    """Contradictions of people who walked past either count as usual ones: the right placement had 0.0001."""
+    placements = []
+    world = "sim:busy,size=0.7,seed=0"
+    TeamRun(CONFIGURATION, halves(world, ("ann", "bob"), 0.6), lambda _, each: placements.append(each)).run()
+    assert placements[-1].probability > 0.9
+
+
 def test_a_run_in_a_team_maps_as_a_run_alone_does():
     _, results, _ = office_run()
     alone = run_log(halves(OFFICE, ("ann", "bob"))["bob"], CONFIGURATION)
@@ -134,6 +143,7 @@ def component(team, name):
 def test_a_robot_that_joins_late_gets_the_whole_map():
     network = Network()
     assert network.pass_messages() == 1
+    assert component(network.new, "ann").clutter == network.ann.state.shared.clutter != NO_CLUTTER
     assert set(component(network.new, "ann").scans) == set(network.ann._own.component().scans)
 
 

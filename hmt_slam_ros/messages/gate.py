@@ -280,6 +280,8 @@ def _check_team_message(message: TeamMessage | JoinedGround) -> None:
     if isinstance(message, TeamUpdate):
         for item in message.items:
             _require(message.after < item.version <= message.until, "version", item.version, "one of the update")
+        for rate in message.clutter:
+            _require(0.0 <= rate <= 1.0, "clutter", rate, "between 0 and 1")
     if isinstance(message, TeamUpdate | JoinedGround):
         _check_items(message.scans, message.areas)
     elif isinstance(message, TeamPlacement):

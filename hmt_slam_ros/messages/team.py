@@ -7,6 +7,7 @@ from enum import StrEnum
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import Arc, Pose
+from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import Scan
 
 MAX_TEAM_AREAS, MAX_TEAM_KEYFRAMES = 2**16, 2**32
@@ -92,6 +93,7 @@ class TeamUpdate:
     :ivar scans: by growing version.
     :ivar areas: likewise. The scans of their keyframes are here, or in an earlier update.
     :ivar is_complete: whether there is nothing newer.
+    :ivar clutter: usual rate of contradictions of the map.
     """
 
     robot: str
@@ -101,6 +103,7 @@ class TeamUpdate:
     scans: tuple[SharedScan, ...]
     areas: tuple[SharedArea, ...]
     is_complete: bool
+    clutter: Clutter
 
     @property
     def items(self) -> tuple[SharedItem, ...]:

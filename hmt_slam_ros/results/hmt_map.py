@@ -20,6 +20,7 @@ from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.metric_slam.slam import SlamState
 from hmt_slam_ros.process_table import COORDINATOR, PROCESSES
+from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
 from hmt_slam_ros.results.log_reading import LogProgress
 from hmt_slam_ros.results.record import RunRecord
 from hmt_slam_ros.results.trajectories import RelativeTrajectory
@@ -162,6 +163,20 @@ def read_saved_map(directory: Path) -> SavedMap:
     poses = {entry.area: entry.pose for entry in document.area_poses}
     configuration = load_configuration(directory / CONFIGURATION)
     return SavedMap(Replica.from_state(document.replica), poses, configuration, document.relative_trajectory)
+
+
+def read_clutter(directory: Path) -> Clutter:
+    """Usual rate of contradictions of a map, none where it was saved without the state of a run.
+
+    :raises HmtSlamError: as :func:`read_saved_map`.
+    """
+    folder = FolderReader(directory, FORMAT, VERSION)
+    if "slam.json" not in folder.names:
+        return NO_CLUTTER
+    slam: SlamState = folder.read("slam", PARTS["slam"])
+    live = slam.live_hypotheses[Replica.from_state(slam.replica).best_hypothesis]
+    own = live.particle_filter or live.line_filter
+    return NO_CLUTTER if own is None else own.clutter_estimate.clutter
 
 
 def read_run_state(directory: Path) -> tuple[RunState, Configuration]:

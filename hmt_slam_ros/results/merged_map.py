@@ -22,7 +22,7 @@ from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, Replica
 from hmt_slam_ros.messages.team import Verdict
 from hmt_slam_ros.results.export import export_topology
-from hmt_slam_ros.results.hmt_map import SavedMap, read_saved_map
+from hmt_slam_ros.results.hmt_map import SavedMap, read_clutter, read_saved_map
 from hmt_slam_ros.results.log_reading import FIXED_PARAMETERS, map_folder
 from hmt_slam_ros.results.output_folder import MERGE_REPORT, TEAM_PICTURE, map_writer
 from hmt_slam_ros.results.recorder import keyframe_poses
@@ -85,7 +85,7 @@ def _read_robot(path: Path, name: str) -> RobotMap:
         raise HmtSlamError(f"{path} has no keyframes to join another map by: leave it out")
     if has_foreign_keyframes(saved.replica.scans):
         raise HmtSlamError(f"{path} has ground of another robot: give maps that were made with team.uses_ground=false")
-    whole = Component.of_map(hybrid_map, saved.replica.scans)
+    whole = Component.of_map(hybrid_map, saved.replica.scans, read_clutter(map_folder(path)))
     return RobotMap(name, saved, split_component(name, whole))
 
 

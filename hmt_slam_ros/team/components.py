@@ -13,6 +13,7 @@ from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import consistent_map
 from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
 from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions
+from hmt_slam_ros.registration.consistency import MAPS_OUTLIER_RATE, NO_CLUTTER, Clutter
 from hmt_slam_ros.sensors import Scan
 
 _GAP = 20.0
@@ -25,21 +26,25 @@ class Component:
 
     :ivar hybrid_map: its areas and arcs; it is not changed.
     :ivar scans: {keyframe: scan} of its keyframes.
+    :ivar clutter: usual rate of contradictions of the map.
     """
 
     hybrid_map: HybridMap
     scans: Mapping[int, Scan]
+    clutter: Clutter = NO_CLUTTER
 
     @classmethod
-    def of_map(cls, hybrid_map: HybridMap, scans: Mapping[int, Scan]) -> Component:
+    def of_map(cls, hybrid_map: HybridMap, scans: Mapping[int, Scan], clutter: Clutter = NO_CLUTTER) -> Component:
         """The component of a whole map.
 
         :param scans: of its keyframes at least.
+        :param clutter: usual rate of contradictions of the map.
         """
         areas = hybrid_map.area_ids()
         return cls(
             hybrid_map.subgraph(areas),
             {keyframe: scans[keyframe] for area in areas for keyframe in hybrid_map.keyframes(area)},
+            clutter,
         )
 
 
@@ -60,6 +65,7 @@ class ComponentPair:
     :ivar other: areas of the second.
     :ivar first_keyframe: number from which on keyframes are those of the second.
     :ivar area_shift: added to the numbers of the second's areas.
+    :ivar clutters: usual rates of contradictions of the first and of the second.
     """
 
     hybrid_map: HybridMap
@@ -68,11 +74,26 @@ class ComponentPair:
     other: tuple[int, ...]
     first_keyframe: int
     area_shift: int
+    clutters: tuple[Clutter, Clutter]
 
     @property
     def joint(self) -> tuple[int, int]:
         """The areas between which the uninformative arc is."""
         return self.known[0], self.other[0]
+
+    @property
+    def clutter(self) -> Clutter:
+        """Usual rate of contradictions between the two: that of maps, and what either has more than that.
+
+        That of walls is for two looks at one map, of which each counts half.
+        """
+        beams = sum(max(0.0, each.beam_outlier_rate - MAPS_OUTLIER_RATE) for each in self.clutters)
+        return Clutter(MAPS_OUTLIER_RATE + beams, 0.5 * sum(each.wall_outlier_rate for each in self.clutters))
+
+    def as_one(self, hybrid_map: HybridMap) -> Component:
+        """Both as one component, with another hybrid map, and the larger of the rates."""
+        clutter = Clutter(*(max(rates) for rates in zip(*self.clutters, strict=True)))
+        return Component(hybrid_map, self.scans, clutter)
 
 
 def combine(first: Component, second: Component, shifts: Shift | None = None) -> ComponentPair:
@@ -92,7 +113,8 @@ def combine(first: Component, second: Component, shifts: Shift | None = None) ->
     combined.set_arc(areas[0], others[0], place, closure=False)
     combined.commit()
     scans = dict(first.scans) | {keyframe + keyframe_shift: scan for keyframe, scan in second.scans.items()}
-    return ComponentPair(combined, scans, tuple(areas), tuple(others), keyframe_shift, area_shift)
+    clutters = first.clutter, second.clutter
+    return ComponentPair(combined, scans, tuple(areas), tuple(others), keyframe_shift, area_shift, clutters)
 
 
 def renumber(hybrid_map: HybridMap, area_shift: int, keyframe_shift: int) -> HybridMap:

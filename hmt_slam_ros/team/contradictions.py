@@ -51,6 +51,7 @@ class PlaceComparison:
         self._grid_cache = GridCache(pair.scans, GridModel.from_configuration(configuration), neighborhood)
         self._settings = replace(MatchSettings.from_options(options), min_log_ratio=MIN_LOG_RATIO)
         self._radius = options.place_radius
+        self._outlier_rate = max(MAPS_OUTLIER_RATE, pair.clutter.beam_outlier_rate)
 
     def log_ratio(self, window: int, area: int, belief: PoseGaussian, is_matched: bool) -> float | None:
         """Log Bayes factor of the contradictions of a window, nats, at most 0; None where it lies in no place.
@@ -71,10 +72,10 @@ class PlaceComparison:
             return None
         query = self._grid_cache.grid(poses)
         if is_matched:
-            return min(0.0, _seen_from(query, place, there.mean))
+            return min(0.0, self._seen_from(query, place, there.mean))
         pose = self._match(query, place, there)
-        forward = MAP_IN_MAP.log_likelihood_ratio(place.grid.compare(query.points, pose), MAPS_OUTLIER_RATE)
-        return min(0.0, forward + _seen_from(query, place, pose))
+        forward = MAP_IN_MAP.log_likelihood_ratio(place.grid.compare(query.points, pose), self._outlier_rate)
+        return min(0.0, forward + self._seen_from(query, place, pose))
 
     def _nearest_area(
         self, area: int, belief: PoseGaussian, poses: Mapping[int, Float64]
@@ -96,8 +97,7 @@ class PlaceComparison:
         found, _ = best_pose(query, place.grid, prior, self._settings)
         return belief.mean if found is None else found[0]
 
-
-def _seen_from(query: AreaGrid, place: AreaPlace, pose: Float64) -> float:
-    """Log Bayes factor of the place's surfaces in what the window saw, nats."""
-    agreement = query.compare(place.grid.points, se2.inverse(pose))
-    return MAP_IN_MAP.log_likelihood_ratio(agreement, MAPS_OUTLIER_RATE)
+    def _seen_from(self, query: AreaGrid, place: AreaPlace, pose: Float64) -> float:
+        """Log Bayes factor of the place's surfaces in what the window saw, nats."""
+        agreement = query.compare(place.grid.points, se2.inverse(pose))
+        return MAP_IN_MAP.log_likelihood_ratio(agreement, self._outlier_rate)

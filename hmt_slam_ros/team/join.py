@@ -74,7 +74,7 @@ def decide(
     joined = join_at(pair, windows, best, options)
     if _is_contradictory(pair, joined, options):
         return Verdict.CONTRADICTORY, None
-    return Verdict.JOINED, Component(_refine(pair, joined, configuration), pair.scans)
+    return Verdict.JOINED, pair.as_one(_refine(pair, joined, configuration))
 
 
 def join_at(

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from hmt_slam_ros.configuration.tree import Configuration
-from hmt_slam_ros.registration.consistency import NO_CLUTTER
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.team.components import ComponentPair
 from hmt_slam_ros.team.contradictions import PlaceComparison
@@ -104,7 +103,7 @@ class PlacementSearch:
             if own.search.unexamined:
                 self._searches[key] = replace(own, search=self._map_search.continue_search(hybrid_map, own.search))
             else:
-                search, is_checked = self._map_search.check_candidates(hybrid_map, own.search, NO_CLUTTER)
+                search, is_checked = self._map_search.check_candidates(hybrid_map, own.search, self.pair.clutter)
                 self._searches[key] = replace(own, search=search, is_checked=is_checked)
             return True
         return False
@@ -114,7 +113,7 @@ class PlacementSearch:
         pair = self.pair
         known = len(pair.known)
         candidates = [
-            window_candidates(n, self._map_search.localize(pair.hybrid_map, own.search, NO_CLUTTER), known)
+            window_candidates(n, self._map_search.localize(pair.hybrid_map, own.search, pair.clutter), known)
             for n, own in enumerate(self._searches.values())
         ]
         geometry = PlacementGeometry(pair.hybrid_map, self._windows)

@@ -24,6 +24,7 @@ from hmt_slam_ros.messages.map_changes import Arc
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.team import SharedArea, SharedItem, SharedScan, TeamUpdate
 from hmt_slam_ros.plain_data import to_plain
+from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.team.components import Component
 from hmt_slam_ros.team.own_ground import own_ground
@@ -53,17 +54,20 @@ class SharedMapState:
 
     :ivar version: of the newest item, 0 before the first.
     :ivar scans: items, by growing version; ``areas`` likewise.
+    :ivar clutter: usual rate of contradictions of the map.
     """
 
     version: int = 0
     scans: tuple[SharedScan, ...] = ()
     areas: tuple[SharedArea, ...] = ()
+    clutter: Clutter = NO_CLUTTER
 
 
 class SharedMap:
     """The map that a robot shares.
 
     :ivar version: of the newest item, 0 before the first.
+    :ivar clutter: usual rate of contradictions of the map.
     """
 
     def __init__(self, robot: str, session: str, state: SharedMapState | None = None) -> None:
@@ -74,6 +78,7 @@ class SharedMap:
         """
         state = state or SharedMapState()
         self.robot, self.session, self.version = robot, session, state.version
+        self.clutter = state.clutter
         # By growing version; a scan comes before its area.
         self._items: OrderedDict[tuple[str, int], SharedItem] = OrderedDict()
         self._contents: dict[int, _Content] = {}
@@ -86,7 +91,7 @@ class SharedMap:
     def state(self) -> SharedMapState:
         """The shared map as a value."""
         scans = tuple(item for item in self._items.values() if isinstance(item, SharedScan))
-        return SharedMapState(self.version, scans, self._areas())
+        return SharedMapState(self.version, scans, self._areas(), self.clutter)
 
     def _areas(self) -> tuple[SharedArea, ...]:
         return tuple(item for item in self._items.values() if isinstance(item, SharedArea))
@@ -171,7 +176,7 @@ class SharedMap:
         last, is_complete = (chosen[-1].version, False) if newer else (self.version, True)
         scans = tuple(item for item in chosen if isinstance(item, SharedScan))
         areas = tuple(item for item in chosen if isinstance(item, SharedArea))
-        return TeamUpdate(self.robot, self.session, version, last, scans, areas, is_complete)
+        return TeamUpdate(self.robot, self.session, version, last, scans, areas, is_complete, self.clutter)
 
 
 def _arcs_by_larger_area(common: CommonMap) -> dict[int, dict[int, ArcValue]]:
@@ -219,12 +224,14 @@ class ForeignMapState:
     :ivar session: of the map.
     :ivar version: up to which it is known, 0 for nothing.
     :ivar scans: of its keyframes, and those of areas that are still to come; ``areas`` likewise.
+    :ivar clutter: usual rate of contradictions of the map.
     """
 
     session: str
     version: int = 0
     scans: tuple[SharedScan, ...] = ()
     areas: tuple[SharedArea, ...] = ()
+    clutter: Clutter = NO_CLUTTER
 
 
 class ForeignMap:
@@ -236,14 +243,15 @@ class ForeignMap:
 
     def __init__(self, state: ForeignMapState) -> None:
         """:param state: to go on from."""
-        self.session, self.version = state.session, state.version
+        self.session, self.version, self._clutter = state.session, state.version, state.clutter
         self._areas = {area.area: area for area in state.areas}
         self._scans = {scan.keyframe: scan for scan in state.scans}
 
     @property
     def state(self) -> ForeignMapState:
         """The map as a value."""
-        return ForeignMapState(self.session, self.version, tuple(self._scans.values()), tuple(self._areas.values()))
+        scans, areas = tuple(self._scans.values()), tuple(self._areas.values())
+        return ForeignMapState(self.session, self.version, scans, areas, self._clutter)
 
     @property
     def scan_count(self) -> int:
@@ -266,7 +274,7 @@ class ForeignMap:
                 self._areas.pop(area.area, None)
                 if area.keyframes:
                     self._areas[area.area] = area
-        self.version = update.until
+        self.version, self._clutter = update.until, update.clutter
         if update.is_complete:
             kept = {keyframe for area in self._areas.values() for keyframe in area.keyframes}
             self._scans = {keyframe: item for keyframe, item in self._scans.items() if keyframe in kept}
@@ -291,4 +299,5 @@ class ForeignMap:
         areas = hybrid_map.area_ids()
         if areas:
             hybrid_map = hybrid_map.subgraph(connected_areas(hybrid_map, areas[0]))
-        return Component.of_map(hybrid_map, {keyframe: item.scan for keyframe, item in self._scans.items()})
+        scans = {keyframe: item.scan for keyframe, item in self._scans.items()}
+        return Component.of_map(hybrid_map, scans, self._clutter)

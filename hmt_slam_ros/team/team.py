@@ -160,7 +160,10 @@ class Team:
     def handle(self, message: Message) -> list[Message]:
         """Process a message of the robot's own chain, or of another robot; the own status lets the search go on."""
         match message:
-            case Keyframe() | Hypotheses():
+            case Keyframe():
+                self._replica.apply_message(message)
+                self._note_clutter(message)
+            case Hypotheses():
                 self._replica.apply_message(message)
             case ClosureDecision():
                 self._replica.apply_decision(message)
@@ -176,6 +179,11 @@ class Team:
             case TeamPlacement():
                 self._note_placement(message)
         return []
+
+    def _note_clutter(self, keyframe: Keyframe) -> None:
+        """Remember the usual rate of contradictions of the map of the most probable hypothesis."""
+        clutter = {each.hypothesis: each.clutter for each in keyframe.estimates}
+        self._shared.clutter = clutter.get(self._replica.best_hypothesis, self._shared.clutter)
 
     def _share(self) -> list[Message]:
         if not self._shared.take_over(self._replica):

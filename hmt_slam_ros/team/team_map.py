@@ -58,7 +58,7 @@ class TeamMap:
         for piece in others:
             pair = combine(whole.component, piece.component)
             shifts = dict(whole.shifts) | _add_shifts(piece, pair.area_shift, pair.first_keyframe)
-            whole = Piece(Component(pair.hybrid_map, pair.scans), shifts)
+            whole = Piece(pair.as_one(pair.hybrid_map), shifts)
         return whole
 
 
@@ -66,7 +66,9 @@ def split_component(name: str, component: Component) -> dict[str, Component]:
     """The pieces of a map that informative arcs hold together, by names."""
     whole = component.hybrid_map
     return {
-        name if n == 1 else f"{name}, piece {n}": Component.of_map(whole.subgraph(areas), component.scans)
+        name if n == 1 else f"{name}, piece {n}": Component.of_map(
+            whole.subgraph(areas), component.scans, component.clutter
+        )
         for n, areas in enumerate(map_pieces(whole), start=1)
     }
 
