@@ -6,16 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from relocalizing import ARC, OPTIONS, GivenSearch, candidate, distribution, make_parent
 from ring_for_tsbi import RING, Run, ring_drive
 from test_topological_inference_branching import OTHER, PATH, ROOM, rooms_apart
-from test_topological_inference_relocalization_rules import (
-    ARC,
-    OPTIONS,
-    GivenSearch,
-    candidate,
-    distribution,
-    make_parent,
-)
 from worlds import box, scan_in
 
 from hmt_slam_ros.configuration import Configuration
