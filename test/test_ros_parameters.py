@@ -6,7 +6,8 @@ pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, 
 
 from logs_for_nodes import corridor_bag
 from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters, SetParametersAtomically
+from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.parameter import Parameter, parameter_value_to_python
 
@@ -147,6 +148,29 @@ def test_a_node_cannot_change_its_own_parameters_past_the_check(make, name, valu
     assert not result.successful
     assert sentence in result.reason
     assert node.configuration == Configuration()
+
+
+def test_every_parameter_of_a_node_has_a_value_and_fixed_ones_are_read_only(listener, start):
+    """`ros2 param dump` prints nothing where one has no value."""
+    start("slam")
+    names = listener.call(ListParameters, "slam/list_parameters", ListParameters.Request()).result.names
+    assert {"laser_pose", "initial_pose", "mode", "filter.particles"} <= set(names)
+    request = GetParameters.Request(names=names)
+    values = listener.call(GetParameters, "slam/get_parameters", request).values
+    assert [n for n, value in zip(names, values, strict=True) if value.type == ParameterType.PARAMETER_NOT_SET] == []
+    described = listener.call(DescribeParameters, "slam/describe_parameters", DescribeParameters.Request(names=names))
+    changeable = {each.name for each in described.descriptors if not each.read_only}
+    of_the_tree = {leaf.name for leaf in flat_parameters(Configuration())}
+    assert changeable & of_the_tree == {"mode"}
+
+
+def test_an_empty_pose_of_a_parameter_file_is_none(make, tmp_path):
+    """As `ros2 param dump` writes it."""
+    file = tmp_path / "slam.yaml"
+    file.write_text("tested:\n  ros__parameters:\n    laser_pose: []\n")
+    node = make("--params-file", str(file))
+    assert declare_laser_pose(node) is None
+    assert list(node.get_parameter("laser_pose").value) == []
 
 
 def test_a_laser_pose_is_three_numbers(make):

@@ -15,7 +15,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry as OdometryMessage
-from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters
 from rclpy.client import Client
 from rclpy.context import Context
@@ -242,7 +242,7 @@ class DoctorNode(Node):
         """The laser's mounting from the parameter of slam, None where it is not set."""
         for full in self._parameter_futures:
             value = self._parameter_value(full, _LASER_POSE)
-            if full.endswith("/slam") and value.type == ParameterType.PARAMETER_DOUBLE_ARRAY:
+            if full.endswith("/slam") and value.double_array_value:
                 return Mounting(np.array(value.double_array_value), 1.0)
         return None
 

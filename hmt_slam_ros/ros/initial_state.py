@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 
 from hmt_slam_ros.configuration import Configuration, load_configuration
 from hmt_slam_ros.errors import HmtSlamError
@@ -23,7 +22,7 @@ from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions
 from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
 from hmt_slam_ros.process_table import COORDINATOR
 from hmt_slam_ros.results.log_reading import describe_parameter_changes, map_folder
-from hmt_slam_ros.ros.parameters import ConfiguredNode
+from hmt_slam_ros.ros.parameters import ConfiguredNode, declare_pose
 from hmt_slam_ros.ros.recovery import CHECKPOINT
 from hmt_slam_ros.saved_map.folder import CONFIGURATION, FORMAT, VERSION, FolderReader
 from hmt_slam_ros.saved_map.validation import check_slam_state
@@ -153,21 +152,17 @@ _GATE_DEVIATIONS = 3.0
 
 
 def declare_initial_pose(node: Node) -> PoseGaussian | None:
-    """Declare ``initial_pose``, and return the belief over ``map_T_base``, None where it is not set.
+    """Declare ``initial_pose``, and return the belief over ``map_T_base``, None where it is empty.
 
     :raises HmtSlamError: for anything but three finite numbers.
     """
-    descriptor = ParameterDescriptor(
-        description="Pose (x, y, theta) of the robot in the map of start_from, m and rad, known to 0.5 m and 15 "
-        "degrees; where it is not set, the robot may be anywhere.",
-        read_only=True,
+    pose = declare_pose(
+        node,
+        "initial_pose",
+        "Pose (x, y, theta) of the robot in the map of start_from, m and rad, known to 0.5 m and 15 degrees; empty "
+        "where the robot may be anywhere.",
     )
-    value = node.declare_parameter("initial_pose", Parameter.Type.DOUBLE_ARRAY, descriptor).value
-    if value is None:
-        return None
-    if len(value) != 3 or not np.isfinite(value).all():
-        raise HmtSlamError(f"initial_pose = {list(value)} is no pose: give x, y in m and theta in rad")
-    return PoseGaussian(np.array(value, dtype=np.float64), _RVIZ_COVARIANCE)
+    return None if pose is None else PoseGaussian(pose, _RVIZ_COVARIANCE)
 
 
 def locate_in_map(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, ParameterType, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -54,13 +54,18 @@ class ConfiguredNode(GuardedNode):
         # rclpy has no public list of the overrides.
         self.configuration = _with_values(Configuration(), self._parameter_overrides.values())
         for parameter in flat_parameters(self.configuration):
-            self.declare_parameter(parameter.name, parameter.default, _descriptor(parameter))
+            is_fixed = parameter.name not in self.changeable_parameters
+            self.declare_parameter(parameter.name, parameter.default, _descriptor(parameter, is_fixed=is_fixed))
         self.add_on_set_parameters_callback(self._check_changes)
         self.add_post_set_parameters_callback(self._apply_changes)
 
     def on_configuration_changed(self, configuration: Configuration) -> None:
         """Apply new values of the changeable parameters."""
         self.configuration = configuration
+
+    def set_parameters(self, parameter_list: list[Parameter]) -> list[SetParametersResult]:
+        """Set parameters one by one, as the services do."""
+        return [self.set_parameters_atomically([parameter]) for parameter in parameter_list]
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters, as the services do.
@@ -106,8 +111,9 @@ def _with_values(configuration: Configuration, parameters: Iterable[Parameter]) 
     return changed
 
 
-def _descriptor(parameter: FlatParameter) -> ParameterDescriptor:
+def _descriptor(parameter: FlatParameter, *, is_fixed: bool) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
+        read_only=is_fixed,
         description=f"{parameter.description} {parameter.unit}".strip(),
         additional_constraints=f"one of {', '.join(parameter.choices)}" if parameter.choices else "",
     )
@@ -140,18 +146,33 @@ def declare_frame(node: Node, which: str, default: str) -> str:
 
 
 def declare_laser_pose(node: Node) -> NDArray[np.float64] | None:
-    """Declare ``laser_pose``, and return ``base_T_laser`` (3,), None where it is not set.
+    """Declare ``laser_pose``, and return ``base_T_laser`` (3,), None where it is empty.
 
     :raises HmtSlamError: for anything but three finite numbers.
     """
-    descriptor = ParameterDescriptor(
-        description="Pose (x, y, theta) of the laser on the robot in m and rad; where it is not set, /tf_static tells.",
-        read_only=True,
+    return declare_pose(
+        node, "laser_pose", "Pose (x, y, theta) of the laser on the robot in m and rad; empty for that of /tf_static."
     )
-    value = node.declare_parameter("laser_pose", Parameter.Type.DOUBLE_ARRAY, descriptor).value
+
+
+def declare_pose(node: Node, name: str, description: str) -> NDArray[np.float64] | None:
+    """Declare a parameter that is a pose, and return it, shape (3,), m, m and rad; None where it is empty.
+
+    An empty one is a value: ``ros2 param dump`` ends at a parameter without one.
+
+    :raises HmtSlamError: for anything but three finite numbers.
+    """
+    kind = ParameterType.PARAMETER_DOUBLE_ARRAY
+    descriptor = ParameterDescriptor(description=description, type=kind)
+    value = node.declare_parameter(name, Parameter.Type.DOUBLE_ARRAY, descriptor).value
     if value is None:
+        # Neither a default nor a parameter file can say that an empty list is one of numbers.
+        value = []
+        node.set_parameters([Parameter(name, Parameter.Type.DOUBLE_ARRAY, value)])
+    node.set_descriptor(name, ParameterDescriptor(description=description, type=kind, read_only=True))
+    if len(value) == 0:
         return None
     pose = np.array(value, dtype=np.float64)
     if pose.shape != (3,) or not np.isfinite(pose).all():
-        raise HmtSlamError(f"laser_pose = {list(value)} is no pose: give x, y in m and theta in rad")
+        raise HmtSlamError(f"{name} = {list(value)} is no pose: give x, y in m and theta in rad")
     return pose
