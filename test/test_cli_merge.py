@@ -12,6 +12,7 @@ from hmt_slam_ros.hybrid_map.shortest_path import map_pieces
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.hmt_map import read_saved_map
 from hmt_slam_ros.results.log_reading import FIXED_PARAMETERS
+from hmt_slam_ros.saved_map.folder import VERSION
 
 WORLD, OTHER = "sim:office,size=0.7,seed=51", "sim:ring,seed=50"
 
@@ -93,5 +94,5 @@ def test_maps_of_other_cells_are_refused(maps, tmp_path, capsys):
 def test_a_map_of_another_version_is_refused(maps, tmp_path, capsys):
     shutil.copytree(maps / "two", tmp_path / "two")
     manifest = tmp_path / "two" / "hmt_map" / "manifest.json"
-    manifest.write_text(manifest.read_text().replace('"version": 28', '"version": 3'))
+    manifest.write_text(manifest.read_text().replace(f'"version": {VERSION}', '"version": 3'))
     assert "map the log again" in fault(capsys, maps / "one", tmp_path / "two", "--out", tmp_path / "out")
