@@ -167,6 +167,7 @@ def test_map_makes_the_folder_and_replaces_it_and_plot_draws_from_it(tmp_path: P
         result = hmt_slam("map", BAG, "--out", out, "--duration", 4, "--seed", seed)
         assert result.returncode == 0, result.stderr
         assert result.stdout.splitlines()[-1].startswith(f"{out}: ")
+        assert (f"hmt_slam map: {out} has an earlier result, which is replaced" in result.stderr) is (seed == 2)
         assert ", 0 dropped" in result.stdout
         assert load_configuration(out / "hmt_map" / "configuration.yaml").seed == seed
     assert [entry.name for entry in out.parent.iterdir()] == ["out"]

@@ -36,7 +36,7 @@ def test_a_small_loop_is_closed_and_mapped_to_two_centimeters(mapped_folder):
 
 def test_its_bag_makes_the_same_map_as_far_as_quaternions_are_exact(mapped_folder, tmp_path):
     folder, _ = mapped_folder
-    hmt_slam("simulate", "ring", "--seed", "2", "--set", "size=0.8", "--out", tmp_path / "bag", check=True)
+    hmt_slam("simulate", "sim:ring", "--seed", "2", "--set", "size=0.8", "--out", tmp_path / "bag", check=True)
     hmt_slam("map", tmp_path / "bag", "--out", tmp_path / "out", check=True)
     found, expected = (np.loadtxt(out / "trajectory.tum") for out in (tmp_path / "out", folder))
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)

@@ -30,7 +30,7 @@ def run_convert(options: argparse.Namespace) -> None:
 def run_simulate(options: argparse.Namespace) -> None:
     """Write a drive through a simulated world as a rosbag2, with its ground truth beside the data."""
     seed = [] if options.seed is None else [f"seed={options.seed}"]
-    name = SIMULATION_PREFIX + ",".join([options.world, *options.settings, *seed])
+    name = SIMULATION_PREFIX + ",".join([options.world.removeprefix(SIMULATION_PREFIX), *options.settings, *seed])
     log = open_log(name, start=options.start or 0.0, duration=options.duration or None)
     write_bag(log, options.out, storage=options.storage)
     write_tum(options.out / "ground_truth.tum", read_true_poses(log))

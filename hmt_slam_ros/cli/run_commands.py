@@ -44,6 +44,7 @@ def run_map(options: argparse.Namespace) -> None:
         raise HmtSlamError(f"map takes one log, and {1 + len(options.others)} are given: give one, or --team")
     configuration, state, log = _initial_state(options)
     report_left_out(log, options.command)
+    check_output(options.out, options.command)
     log_seconds = log.duration
     with atomic_output(options.out) as folder:
         writer = map_writer(folder)
@@ -54,6 +55,17 @@ def run_map(options: argparse.Namespace) -> None:
             shutil.rmtree(folder / HMT_MAP)
             shutil.copytree(map_folder(options.source), folder / HMT_MAP)
     print(summary(options.out, final.recording, log_seconds, figures.wall_seconds))
+
+
+def check_output(directory: Path, command: str) -> None:
+    """Check that writing to an output folder loses no data, and say on stderr where it replaces an earlier result.
+
+    :raises HmtSlamError: unless there is nothing, an empty folder or an old output folder.
+    """
+    check_replaceable(directory.absolute())
+    if directory.is_dir() and any(directory.iterdir()):
+        sentence = f"{directory} has an earlier result, which is replaced when the new one is complete"
+        print(f"hmt_slam {command}: {sentence}", file=sys.stderr)
 
 
 def _initial_state(options: argparse.Namespace) -> tuple[Configuration, RunState, Log]:
@@ -143,7 +155,7 @@ def finish_measured(
 def run_replay(options: argparse.Namespace) -> None:
     """Start the nodes, wait for the end of the log and print a summary."""
     configuration = chosen_configuration(options)
-    check_replaceable(options.out.absolute())
+    check_output(options.out, options.command)
     log = open_log(options.log, start=configuration.robot.start, duration=configuration.robot.duration or None)
     report_left_out(log, options.command)
     try:

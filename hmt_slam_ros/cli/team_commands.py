@@ -7,7 +7,7 @@ import sys
 import time
 
 from hmt_slam_ros.cli.arguments import chosen_configuration
-from hmt_slam_ros.cli.run_commands import finish_measured, open_time_window
+from hmt_slam_ros.cli.run_commands import check_output, finish_measured, open_time_window
 from hmt_slam_ros.cli.terminal import report_left_out, summary
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
@@ -25,6 +25,7 @@ def run_team(options: argparse.Namespace) -> None:
     for log in logs.values():
         report_left_out(log, options.command)
     wall, cpu = time.monotonic(), time.process_time()
+    check_output(options.out, options.command)
     with atomic_output(options.out) as folder:
         writers = {}
         for name in logs:
