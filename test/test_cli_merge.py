@@ -10,7 +10,8 @@ from hmt_slam_ros.cli.main import FAULT, main
 from hmt_slam_ros.grids.occupancy_map import read_map
 from hmt_slam_ros.hybrid_map.shortest_path import map_pieces
 from hmt_slam_ros.open_log import open_log
-from hmt_slam_ros.results.hmt_map import read_saved_map
+from hmt_slam_ros.registration.consistency import NO_CLUTTER
+from hmt_slam_ros.results.hmt_map import read_clutter, read_saved_map
 from hmt_slam_ros.results.log_reading import FIXED_PARAMETERS
 from hmt_slam_ros.saved_map.folder import VERSION
 
@@ -52,6 +53,9 @@ def test_maps_are_joined_where_they_show_the_same_ground(maps, tmp_path, capsys)
     parts = [read_saved_map(maps / name / "hmt_map") for name in ("one", "two", "elsewhere")]
     assert len(saved.replica.scans) == sum(len(part.replica.scans) for part in parts)
     assert saved.relative_trajectory.keyframes.size == sum(p.relative_trajectory.keyframes.size for p in parts)
+    # How often scans contradict a map is known where a run made it.
+    assert 0.0 < read_clutter(maps / "one" / "hmt_map").beam_outlier_rate < 0.01
+    assert read_clutter(out / "hmt_map") == NO_CLUTTER
     report = json.loads((out / "merge.json").read_text())
     assert [met["verdict"] for met in report["meetings"]] == ["joined", "apart"]
     first = report["meetings"][0]
