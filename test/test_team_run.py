@@ -168,6 +168,16 @@ def test_a_map_of_another_session_is_joined_with_nothing():
     assert team.map_poses.keys() == {"bob"}
 
 
+def test_a_search_ends_though_keyframes_were_pruned():
+    bob = Team(CONFIGURATION, office_run()[0].teams["bob"].state)
+    bob._pairs["ann"].keyframes = 10**6
+    for _ in range(1000):
+        bob.search(100, may_wait=False)
+        if not bob.is_searching:
+            break
+    assert not bob.is_searching
+
+
 def test_a_robot_whose_process_ended_stays_joined():
     bob = office_run()[0].teams["bob"]
     assert bob.state.joins["ann"].joining_arcs

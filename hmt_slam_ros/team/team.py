@@ -282,7 +282,8 @@ class Team:
     def _update(self, name: str, pair: _PairState, growth: int) -> None:
         """Let the search of a pair go on with the maps of now, if both have areas, and have grown enough."""
         keyframes = self._own.scan_count + self._others[name].map.scan_count
-        if keyframes - pair.keyframes < growth:
+        # Keyframes are pruned, too.
+        if 0 <= keyframes - pair.keyframes < growth:
             return
         pair.is_outdated, pair.keyframes = False, keyframes
         own, other = self._own.component(), self._others[name].map.component()
