@@ -21,7 +21,7 @@ from hmt_slam_ros.hybrid_map.surroundings import (
     stack_poses,
 )
 from hmt_slam_ros.registration.area_to_area import MatchSettings, best_pose
-from hmt_slam_ros.registration.consistency import MAP_IN_MAP, MAPS_OUTLIER_RATE
+from hmt_slam_ros.registration.consistency import MAP_IN_MAP
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel
 from hmt_slam_ros.team.components import ComponentPair
 from hmt_slam_ros.team.placement import PlacementGeometry
@@ -51,7 +51,7 @@ class PlaceComparison:
         self._grid_cache = GridCache(pair.scans, GridModel.from_configuration(configuration), neighborhood)
         self._settings = replace(MatchSettings.from_options(options), min_log_ratio=MIN_LOG_RATIO)
         self._radius = options.place_radius
-        self._outlier_rate = max(MAPS_OUTLIER_RATE, pair.clutter.beam_outlier_rate)
+        self._outlier_rate = pair.clutter.beam_outlier_rate
 
     def log_ratio(self, window: int, area: int, belief: PoseGaussian, is_matched: bool) -> float | None:
         """Log Bayes factor of the contradictions of a window, nats, at most 0; None where it lies in no place.
