@@ -15,6 +15,7 @@ from hmt_slam_ros.topological_inference.hypothesis_agreement import (
 SHARP, VAGUE = np.diag([0.05, 0.05, 0.01]) ** 2, np.diag([2.0, 2.0, 0.2]) ** 2
 STEP = np.array([10.0, 0.0, 0.0])
 POSE = np.array([1.0, 0.5, 0.3])
+DOMINANCE = 0.99
 
 
 def chain(covariance=SHARP):
@@ -114,9 +115,40 @@ def test_uncertain_poses_imply_no_closure():
 def test_the_heaviest_represents_all_equivalent_ones():
     hypotheses = [enter_known_area(0, POSE), enter_known_area(1, POSE), enter_known_area(0, POSE + 0.01)]
     weights = np.log([0.2, 0.3, 0.5])
-    found = merge_equivalent(hypotheses, weights)
+    found = merge_equivalent(hypotheses, weights, DOMINANCE)
     assert list(found) == [2, 1]
     np.testing.assert_allclose(np.exp(list(found.values())), [0.7, 0.3])
+
+
+def with_remote_loop(hypothesis):
+    """The same with an arc between two areas that the robot is not near, of which the arcs tell little."""
+    hypothesis.hybrid_map.set_arc(1, 3, PoseGaussian(2.0 * STEP, SHARP), closure=True)
+    return hypothesis
+
+
+@pytest.mark.parametrize(("probabilities", "kept"), [([0.15, 0.85], {0: 1.0}), ([0.005, 0.995], {0: 0.005, 1: 0.995})])
+def test_of_two_that_no_scan_here_tells_apart_the_one_that_leaves_a_loop_open_represents_both(probabilities, kept):
+    hypotheses = [enter_known_area(0, POSE), with_remote_loop(enter_known_area(0, POSE))]
+    assert hypotheses[0].leaves_open(hypotheses[1])
+    assert not hypotheses[1].leaves_open(hypotheses[0])
+    found = merge_equivalent(hypotheses, np.log(probabilities), DOMINANCE)
+    assert {n: pytest.approx(np.exp(weight)) for n, weight in found.items()} == kept
+
+
+def test_a_loop_beside_the_robot_is_not_left_open():
+    hypotheses = [enter_known_area(0, POSE), with_another_loop(enter_known_area(0, POSE))]
+    assert not hypotheses[0].leaves_open(hypotheses[1])
+    assert len(merge_equivalent(hypotheses, np.log([0.5, 0.5]), DOMINANCE)) == 2
+
+
+def test_a_hypothesis_without_a_loop_does_not_represent_one_that_closes_some():
+    tracked, closed = (LocalizedHypothesis(chain(VAGUE), 0, POSE, {0}) for _ in range(2))
+    assert not tracked.leaves_open(with_remote_loop(closed))
+
+
+def test_hypotheses_with_different_poses_of_the_robot_stay_apart():
+    one, other = enter_known_area(0, POSE), with_remote_loop(enter_known_area(0, POSE + 1.0))
+    assert not one.leaves_open(other)
 
 
 def in_new_ground(covariance):

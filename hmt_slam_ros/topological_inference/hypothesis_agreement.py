@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
@@ -82,16 +83,37 @@ class LocalizedHypothesis:
 
         A closure is a statement of its own, even where the arcs alone imply it.
         """
-        if bool(self.closures) != bool(other.closures) or self.removed_arcs != other.removed_arcs:
+        return (
+            bool(self.closures) == bool(other.closures)
+            and self._is_in_same_place(other)
+            and not self._unimplied_closures(other)
+            and not other._unimplied_closures(self)
+        )
+
+    def leaves_open(self, other: LocalizedHypothesis) -> bool:
+        """Whether another hypothesis closes the same loops, and more, whose areas are not around the robot.
+
+        Both expect the same scans here, so that none tells whether those closures are true.
+        """
+        if not self.closures or not self._is_in_same_place(other) or other._unimplied_closures(self):
             return False
+        nearby = {*self.nearby_areas, *other.nearby_areas}
+        more = self._unimplied_closures(other)
+        return bool(more) and nearby.isdisjoint(area for pair in more for area in pair)
+
+    def _is_in_same_place(self, other: LocalizedHypothesis) -> bool:
+        """Whether both lack the same arcs, and have the same robot pose in all common areas around it."""
         nearby = {*self.nearby_areas, *other.nearby_areas}
         common = {area for area in nearby if self._has_areas(area) and other._has_areas(area)}
         return (
-            bool(common)
+            self.removed_arcs == other.removed_arcs
+            and bool(common)
             and all(self._agrees_on_pose(other, area) for area in common)
-            and all(other._implies_closure(pair, arc) for pair, arc in self.closures.items())
-            and all(self._implies_closure(pair, arc) for pair, arc in other.closures.items())
         )
+
+    def _unimplied_closures(self, other: LocalizedHypothesis) -> list[AreaPair]:
+        """The closures of another hypothesis that this one does not imply."""
+        return [pair for pair, arc in other.closures.items() if not self._implies_closure(pair, arc)]
 
     def is_elsewhere(self, other: LocalizedHypothesis) -> bool:
         """Whether the robot is in another place under another hypothesis, and no uncertainty of the arcs explains that.
@@ -145,13 +167,35 @@ class LocalizedHypothesis:
         return is_near and abs(float(difference[2])) <= _SAME_ANGLE
 
 
-def merge_equivalent(hypotheses: Sequence[LocalizedHypothesis], log_weights: Sequence[float]) -> dict[int, float]:
-    """{number of a hypothesis: log of the weight of all equivalent ones}, the heaviest of each first."""
+def merge_equivalent(
+    hypotheses: Sequence[LocalizedHypothesis], log_weights: Sequence[float], dominance: float
+) -> dict[int, float]:
+    """{number of a hypothesis: log of the weight of all that it represents}.
+
+    The heaviest represents all equivalent ones. Of two that no scan here can tell apart, that which leaves open what
+    the other closes represents both, unless the other one dominates it.
+
+    :param dominance: share of the weight of both from which on a hypothesis dominates another.
+    """
     merged: dict[int, float] = {}
     for number in sorted(range(len(hypotheses)), key=lambda n: (-log_weights[n], n)):
         same = next((kept for kept in merged if hypotheses[kept].is_equivalent(hypotheses[number])), number)
         merged[same] = float(np.logaddexp(merged.get(same, -math.inf), log_weights[number]))
+    _merge_into_open(hypotheses, merged, float(scipy.special.logit(dominance)))
     return merged
+
+
+def _merge_into_open(hypotheses: Sequence[LocalizedHypothesis], merged: dict[int, float], log_odds: float) -> None:
+    """Merge each hypothesis into the heaviest that leaves its closures open, below these log-odds to that."""
+    for number in list(merged):
+        weaker = {
+            kept: log_weight
+            for kept, log_weight in merged.items()
+            if merged[number] - log_weight < log_odds and hypotheses[kept].leaves_open(hypotheses[number])
+        }
+        if weaker:
+            heaviest = max(weaker, key=lambda kept: weaker[kept])
+            merged[heaviest] = float(np.logaddexp(weaker[heaviest], merged.pop(number)))
 
 
 def elsewhere_probability(hypotheses: Sequence[LocalizedHypothesis], probabilities: Sequence[float]) -> float:

@@ -118,6 +118,7 @@ class Tsbi:
         """
         state = state or TsbiState()
         self._options = configuration.tsbi
+        self._dominance = configuration.tlca.accept_probability
         self._seed = configuration.seed
         self._replica = Replica.from_state(state.replica)
         self._branching = branching(configuration, self._replica)
@@ -287,7 +288,7 @@ class Tsbi:
             LocalizedHypothesis(p.hybrid_map, p.area, pose, {p.area, *p.local_area_poses()})
             for p, pose in zip(parents, poses, strict=True)
         ]
-        log_weights = merge_equivalent(localized, [parent.log_weight for parent in parents])
+        log_weights = merge_equivalent(localized, [parent.log_weight for parent in parents], self._dominance)
         return [replace(parents[n], log_weight=log_weight) for n, log_weight in sorted(log_weights.items())]
 
     def _parent(self, hypothesis: int) -> Parent:
