@@ -16,7 +16,7 @@ from browser import Browser, Page, find_browser
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.qos import HistoryPolicy, QoSProfile
@@ -26,13 +26,26 @@ from visualization_msgs.msg import MarkerArray
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
+from hmt_slam_ros.messages.documents import encode
 from hmt_slam_ros.messages.map_changes import Arc, AreaPose
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, HypothesisEstimate, Keyframe
+from hmt_slam_ros.messages.team import TeamPlacement, Verdict
 from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
-from hmt_slam_ros.ros.topics import DIAGNOSTICS, FINISHED, GRAPH, HMT_POSE, MAP, PARTICLES, PMF, POSE, TFMessage
+from hmt_slam_ros.ros.topics import (
+    DIAGNOSTICS,
+    DOCUMENTS,
+    FINISHED,
+    GRAPH,
+    HMT_POSE,
+    MAP,
+    PARTICLES,
+    PMF,
+    POSE,
+    TFMessage,
+)
 from hmt_slam_ros.sensors import Scan
 
 BUNDLED = Path(__file__).resolve().parent.parent / "data" / "malaga_one_loop"
@@ -258,3 +271,40 @@ def test_a_page_shows_the_robot_of_its_namespace_alone_and_has_its_port_alone(li
     assert "cannot listen on 127.0.0.1" in second.communicate()[1]
     assert third.wait(20) == 2
     assert "Max: 65535, value: 70000" in third.communicate()[1]
+
+
+def test_a_page_shows_the_robots_of_the_team_that_are_joined(listener, start):
+    port = free_port()
+    view = start("view", "-r", "__ns:=/ann", port=port)
+    node = listener.node
+    health = node.create_publisher(DiagnosticArray, "/ann/diagnostics", topics.STREAM)
+    placements = node.create_publisher(String, DOCUMENTS[TeamPlacement], topics.TEAM_HISTORY)
+    poses = node.create_publisher(PoseWithCovarianceStamped, "/bob/pose", topics.STREAM)
+    grids = node.create_publisher(OccupancyGrid, "/bob/map", topics.LATCHED)
+    listener.until(lambda: is_served(port) and placements.get_subscription_count() > 0, alive=[view])
+    team = DiagnosticStatus(name="/ann/team", hardware_id="hmt_slam_ros", values=[KeyValue(key="robot", value="ann")])
+    place = np.array([4.0, 0.0, 0.5 * np.pi])
+    for name in ("bob", "c-3po"):
+        verdict = Verdict.JOINED if name == "bob" else Verdict.APART
+        placements.publish(String(data=encode(TeamPlacement("ann", "ann", name, verdict, 0.999, 0.001, place))))
+    grid = OccupancyGrid(data=[0, 100, -1, 0])
+    grid.info.width, grid.info.height, grid.info.resolution = 2, 2, 0.5
+    grids.publish(grid)
+    pose = PoseWithCovarianceStamped()
+    pose.pose.pose.position.x, pose.pose.pose.orientation.w = 2.0, 1.0
+
+    def is_shown():
+        health.publish(DiagnosticArray(status=[team]))
+        poses.publish(pose)
+        rows = snapshot(port).get("team", [])
+        return len(rows) == 2 and "robot" in rows[0]
+
+    listener.until(is_shown, alive=[view])
+    bob, other = snapshot(port)["team"]
+    assert bob["robot"][:2] == pytest.approx([4.0, 2.0], abs=0.01)
+    assert bob["map"] is None  # nobody looks at the page
+    assert (other["joined"], other["verdict"]) == (False, "apart")
+    with urlopen(f"http://127.0.0.1:{port}/news", timeout=20):
+        listener.until(lambda: snapshot(port)["team"][0]["map"] is not None, alive=[view])
+        with urlopen(f"http://127.0.0.1:{port}/map.png?robot=bob", timeout=20) as answer:
+            assert answer.read().startswith(b"\x89PNG")

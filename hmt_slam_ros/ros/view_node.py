@@ -20,12 +20,13 @@ from visualization_msgs.msg import MarkerArray
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.documents import KeyframeHeader, RobotStatus
 from hmt_slam_ros.messages.messages import Hypotheses
-from hmt_slam_ros.process_table import process_names, producer
+from hmt_slam_ros.process_table import TEAM, process_names, producer
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, SYSTEM, NodeDiagnostics
 from hmt_slam_ros.ros.guarded_node import GuardedNode
 from hmt_slam_ros.ros.message_io import document_callback
 from hmt_slam_ros.ros.parameters import declare_system
+from hmt_slam_ros.ros.team_view import TeamView
 from hmt_slam_ros.ros.topics import (
     DIAGNOSTICS,
     DOCUMENTS,
@@ -123,6 +124,7 @@ class ViewNode(GuardedNode):
         on_status = document_callback(self.diagnostics, RobotStatus, self._on_robot_status, may_be_unnamed=True)
         self._subscribe(String, DOCUMENTS[RobotStatus], on_status, topics.LATCHED)
         self._subscribe(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, topics.STREAM)
+        self._team = TeamView(self.board, self._subscribe, self.destroy_subscription)
         self._publish_health()
         self.get_logger().info(f"the page is at {self._server.url}")
 
@@ -166,6 +168,7 @@ class ViewNode(GuardedNode):
                 self._history.publish_complete()
                 self._publish_health()
                 self._update_map_subscription()
+                self._team.update()
         finally:
             executor.shutdown()
 
@@ -221,6 +224,8 @@ class ViewNode(GuardedNode):
                     self.diagnostics.system.admit(values[SYSTEM])
                 name, level = status.name.rsplit("/", 1)[-1], int.from_bytes(status.level, "little")
                 self._health.update(name, level, status.message, values, self._listening_time)
+                if name == TEAM.name and "robot" in values:
+                    self._team.note_name(values["robot"])
 
     def _on_map(self, message: OccupancyGrid) -> None:
         section, cells = map_section(message), map_cells(message)

@@ -124,7 +124,7 @@ class Board:
         self._history: deque[Any] = deque(maxlen=HISTORY_LENGTH)
         self._event_count, self._generation = 0, 0
         self._watchers, self._last_watched = 0, -_RECONNECT_TIME
-        self._map_image, self._map_tag = b"", ""
+        self._map_images: dict[str, tuple[bytes, str]] = {}
 
     def put(self, section: str, content: Any) -> None:  # noqa: ANN401  any JSON value
         """Replace a section, unless it is equal.
@@ -157,16 +157,20 @@ class Board:
             self._generation += 1
             self._condition.notify_all()
 
-    def put_map_image(self, picture: bytes) -> str:
-        """Replace the picture of the map, a PNG, and return its HTTP entity tag."""
-        with self._condition:
-            self._map_image, self._map_tag = picture, hashlib.sha256(picture).hexdigest()[:16]
-            return self._map_tag
+    def put_map_image(self, picture: bytes, robot: str = "") -> str:
+        """Replace the picture of the map, a PNG, and return its HTTP entity tag.
 
-    def map_image(self) -> tuple[bytes, str]:
-        """The picture of the map, empty where there is none, and its tag."""
+        :param robot: name of another robot whose map it is; empty for that of the page.
+        """
         with self._condition:
-            return self._map_image, self._map_tag
+            tag = hashlib.sha256(picture).hexdigest()[:16]
+            self._map_images[robot] = picture, tag
+            return tag
+
+    def map_image(self, robot: str = "") -> tuple[bytes, str]:
+        """The picture of a robot's map, empty where there is none, and its tag."""
+        with self._condition:
+            return self._map_images.get(robot, (b"", ""))
 
     def wait_for_changes(self, client: ClientState, timeout: float = 0.0) -> dict[str, Any]:
         """The sections and events that a browser does not have, {} where there are none; updates the client's state.

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
+from urllib.parse import parse_qs
 
 import numpy as np
 from numpy.typing import NDArray
@@ -195,7 +196,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Answer a browser."""
         self._mark(is_idle=False)
-        path = self.path.partition("?")[0]
+        path, _, query = self.path.partition("?")
         objection = self.hosts.objection(self.headers, self.connection.getsockname()[0])
         if objection:
             self._answer(HTTPStatus.FORBIDDEN, "text/plain", objection.encode())
@@ -203,7 +204,7 @@ class _Handler(BaseHTTPRequestHandler):
             name, kind = _FILES[path]
             self._answer(HTTPStatus.OK, kind, (PAGE / name).read_bytes())
         elif path == "/map.png":
-            self._send_map_image()
+            self._send_map_image("".join(parse_qs(query).get("robot", [])))
         elif path == "/snapshot.json":
             content = json.dumps(self.board.wait_for_changes(ClientState()), allow_nan=False).encode()
             self._answer(HTTPStatus.OK, "application/json", content)
@@ -212,8 +213,8 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._answer(HTTPStatus.NOT_FOUND, "text/plain", b"there is no such page")
 
-    def _send_map_image(self) -> None:
-        picture, tag = self.board.map_image()
+    def _send_map_image(self, robot: str) -> None:
+        picture, tag = self.board.map_image(robot)
         if not picture:
             self._answer(HTTPStatus.NOT_FOUND, "text/plain", b"there is no map yet")
         elif self.headers.get("If-None-Match") == f'"{tag}"':

@@ -29,21 +29,30 @@ export function themed(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
-/** The map's picture in the colours of the theme, on a canvas of its own. */
-export function tinted(image) {
+const ROBOTS = ["#1f77b4", "#e0730d", "#2ca02c", "#d62768", "#9467bd", "#8c6d31", "#17a2b8", "#7f7f7f"];
+
+/** The colour of a robot of the team, by its place among the names. */
+export function robotColour(place) {
+  return ROBOTS[place % ROBOTS.length];
+}
+
+/** The map's picture in the colours of the theme, or of another robot, on a canvas of its own. */
+export function tinted(image, paint) {
   const canvas = document.createElement("canvas");
   canvas.width = image.naturalWidth;
   canvas.height = image.naturalHeight;
   const context = canvas.getContext("2d", { willReadFrequently: true });
   context.drawImage(image, 0, 0);
   const picture = context.getImageData(0, 0, canvas.width, canvas.height);
-  const [free, wall] = ["--free", "--wall"].map((name) => rgb(themed(name)));
+  const [free, wall] = paint ? [rgb(paint), rgb(paint)] : ["--free", "--wall"].map((name) => rgb(themed(name)));
   const { data } = picture;
   for (let k = 0; k < data.length; k += 4) {
     if (data[k] < 40) {
       data[k + 3] = 0;
     } else {
-      [data[k], data[k + 1], data[k + 2]] = data[k] > 128 ? wall : free;
+      const isWall = data[k] > 128;
+      [data[k], data[k + 1], data[k + 2]] = isWall ? wall : free;
+      if (paint) data[k + 3] = isWall ? 200 : 40;
     }
   }
   context.putImageData(picture, 0, 0);
@@ -89,8 +98,8 @@ export class Camera {
   }
 }
 
-/** Draw the plan; returns what was drawn, and where: {areas, arcs, closures, robot, factor, map, middle, spots}. */
-export function drawPlan(canvas, camera, state, picture, trail) {
+/** Draw the plan; returns what was drawn, and where: {areas, arcs, closures, robot, factor, map, middle, spots, team}. */
+export function drawPlan(canvas, camera, state, picture, trail, team) {
   const { context, width, height } = prepared(canvas);
   [camera.width, camera.height] = [width, height];
   context.fillStyle = themed("--unknown");
@@ -104,6 +113,7 @@ export function drawPlan(canvas, camera, state, picture, trail) {
     context.drawImage(picture, u, v, state.map.size[0] * camera.scale, state.map.size[1] * camera.scale);
     drawn.map = true;
   }
+  drawn.team = team.map((other) => drawOther(context, camera, other));
   drawTrail(context, camera, trail);
   if (state.graph) {
     drawn.factor = factorOf(state.graph, camera);
@@ -125,6 +135,23 @@ export function drawPlan(canvas, camera, state, picture, trail) {
 function factorOf(graph, camera) {
   const largest = Math.max(0, ...graph.arcs.map((arc) => arc.ellipse?.[0] ?? 0)) * camera.scale;
   return FACTORS.find((factor) => factor * largest >= VISIBLE) ?? (largest ? FACTORS.at(-1) : 1);
+}
+
+/** Draw the map and the pose of another robot that is joined; returns its name, and whether each of them was drawn. */
+function drawOther(context, camera, { name, frame, map, robot, paint, picture }) {
+  if (map && picture) {
+    const [left, bottom] = map.origin;
+    const [u, v] = camera.toScreen(frame);
+    context.save();
+    context.translate(u, v);
+    context.rotate(-frame[2]);
+    const [width, height] = map.size.map((length) => length * camera.scale);
+    context.imageSmoothingEnabled = width < picture.width;
+    context.drawImage(picture, left * camera.scale, -bottom * camera.scale - height, width, height);
+    context.restore();
+  }
+  if (robot) drawArrow(context, camera, robot, paint, name);
+  return { name, map: Boolean(map && picture), robot: Boolean(robot) };
 }
 
 function drawTrail(context, camera, trail) {
@@ -192,8 +219,7 @@ function drawArea(context, camera, area, here) {
 }
 
 function drawRobot(context, camera, robot) {
-  const [x, y, theta] = robot.pose;
-  const [u, v] = camera.toScreen([x, y]);
+  const [x, y] = robot.pose;
   const paint = themed("--robot");
   context.fillStyle = context.strokeStyle = paint;
   if (robot.ellipse) {
@@ -205,10 +231,17 @@ function drawRobot(context, camera, robot) {
     context.stroke();
     context.globalAlpha = 1;
   }
+  drawArrow(context, camera, robot.pose, paint);
+}
+
+/** An arrow at a pose, with a name beside it where one is given. */
+function drawArrow(context, camera, pose, paint, name = "") {
+  const [u, v] = camera.toScreen(pose);
   const size = Math.min(16, Math.max(10, 0.45 * camera.scale));
+  context.fillStyle = paint;
   context.save();
   context.translate(u, v);
-  context.rotate(-theta);
+  context.rotate(-pose[2]);
   context.beginPath();
   context.moveTo(size, 0);
   context.lineTo(-0.7 * size, 0.65 * size);
@@ -220,6 +253,12 @@ function drawRobot(context, camera, robot) {
   context.lineWidth = 1.5;
   context.stroke();
   context.restore();
+  if (!name) return;
+  context.font = "600 12px system-ui, sans-serif";
+  context.textAlign = "center";
+  context.textBaseline = "top";
+  context.fillStyle = paint;
+  context.fillText(name, u, v + size);
 }
 
 /** Seconds from the first event to each; stamps may jump back, as where a bag begins anew. */

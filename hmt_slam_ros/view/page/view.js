@@ -1,6 +1,6 @@
 // The page: takes the news that the server streams, and shows them.
 
-import { Camera, colour, drawCourse, drawPlan, middle, seconds, themed, tinted } from "./draw.js";
+import { Camera, colour, drawCourse, drawPlan, middle, robotColour, seconds, themed, tinted } from "./draw.js";
 
 const MOST_EVENTS = 1000;
 const TRAIL = 600; // points
@@ -12,6 +12,7 @@ let events = [];
 let trail = [];
 let picture = null;
 let image = null;
+let team = []; // the robots that are joined, each with its colour and the picture of its map
 let mode = "fit"; // or "follow", or "free"
 let due = false;
 
@@ -32,7 +33,7 @@ function draw() {
   [camera.width, camera.height] = [plan.clientWidth, plan.clientHeight];
   if (mode === "fit") fit();
   if (mode === "follow" && state.robot) [camera.x, camera.y] = state.robot.pose;
-  const drawn = drawPlan(plan, camera, state, picture, trail);
+  const drawn = drawPlan(plan, camera, state, picture, trail, team);
   drawn.events = drawCourse($("course"), events);
   drawn.bars = $("bars").children.length;
   plan.dataset.drawn = JSON.stringify(drawn);
@@ -47,11 +48,19 @@ function fit() {
     ...(state.graph?.areas ?? []).map((area) => area.at),
     ...(state.robot && !state.map ? [state.robot.pose] : []),
     ...(state.map ? [state.map.origin, state.map.origin.map((start, k) => start + state.map.size[k])] : []),
+    ...team.flatMap(corners),
   ];
   if (points.length === 0) return;
   const low = [0, 1].map((k) => Math.min(...points.map((point) => point[k])));
   const high = [0, 1].map((k) => Math.max(...points.map((point) => point[k])));
   camera.fit(low, high.map((end, k) => end - low[k]));
+}
+
+/** Where another robot's map and the robot are in this map. */
+function corners({ frame: [x, y, theta], map, robot }) {
+  const [cos, sin] = [Math.cos(theta), Math.sin(theta)];
+  const own = (map ? [0, 1, 2, 3] : []).map((k) => [k & 1, k >> 1].map((far, axis) => map.origin[axis] + far * map.size[axis]));
+  return [...own.map(([u, v]) => [x + cos * u - sin * v, y + sin * u + cos * v]), ...(robot ? [robot] : [])];
 }
 
 function drawScale() {
@@ -104,6 +113,7 @@ const shown = {
     events = [...(anew ? [] : events), ...more].slice(-MOST_EVENTS);
     tellHypotheses();
   },
+  team: tellTeam,
   nodes: tellNodes,
   topics: tellTopics,
 };
@@ -148,6 +158,42 @@ function bar(name, number, probability, paint) {
   share.textContent = probability > 0.9995 || probability < 0.0005
     ? `${(100 * probability).toFixed(0)} %` : `${(100 * probability).toFixed(1)} %`;
   row.append(label, track, share);
+  return row;
+}
+
+/** Say how the maps of the other robots lie, and draw those that are joined. */
+function tellTeam(robots) {
+  $("team").hidden = robots.length === 0;
+  const before = team;
+  team = robots.flatMap((robot, place) => robot.joined ? [{ ...robot, paint: robotColour(place) }] : []);
+  team.forEach((robot) => takePicture(robot, before.find(({ name }) => name === robot.name)));
+  $("robots").replaceChildren(...robots.map(robotRow));
+}
+
+/** Load the picture of a robot's map, or take that of before where it is the same. */
+function takePicture(robot, before) {
+  robot.picture = before?.picture;
+  if (!robot.map || before?.map?.tag === robot.map.tag) return;
+  const next = new Image();
+  next.onload = () => {
+    const now = team.find(({ name }) => name === robot.name);
+    if (now) now.picture = tinted(next, now.paint);
+    redraw();
+  };
+  next.src = `map.png?robot=${encodeURIComponent(robot.name)}&${robot.map.tag}`;
+}
+
+function robotRow({ name, joined, verdict, probability, apart }, place) {
+  const row = document.createElement("li");
+  const [dot, label, answer] = ["span", "span", "small"].map((kind) => document.createElement(kind));
+  dot.className = "dot";
+  row.style.setProperty("--robot-colour", joined ? robotColour(place) : "var(--line)");
+  label.textContent = name;
+  const best = probability === undefined ? "" : `, best placement ${(100 * probability).toFixed(1)} %`;
+  if (verdict === null) answer.textContent = joined ? "joined by others" : "not compared yet";
+  else if (joined) answer.textContent = verdict === "joined" ? `joined, ${(100 * probability).toFixed(1)} %` : `joined by others${best}`;
+  else answer.textContent = `${verdict}${best}, apart ${(100 * apart).toFixed(1)} %`;
+  row.append(dot, label, answer);
   return row;
 }
 
