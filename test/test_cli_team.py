@@ -1,4 +1,4 @@
-"""The command ``map --team``."""
+"""The commands ``map --team`` and ``replay --team``."""
 
 import json
 import re
@@ -31,6 +31,26 @@ def test_robots_of_one_building_have_one_map_and_each_its_own(tmp_path, capsys):
     assert {"hmt_map", "map.png", "topology.graphml"} <= {each.name for each in out.iterdir()}
     # An old result is replaced.
     assert run_map(FIRST, SECOND, "--team", "--duration", "10", "--out", out) == 0
+
+
+def test_nodes_of_two_robots_replay_their_logs_at_once(tmp_path, capsys):
+    pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
+    out = tmp_path / "out"
+    words = (FIRST, SECOND, "--team", "--duration", "25", "--set", "robot.rate=0", "--out", out)
+    assert main(["replay", *map(str, words)]) == 0
+    printed = capsys.readouterr().out
+    assert len(re.findall(r"robot_[12]: 126 of 126 scans, 0 dropped", printed)) == 2
+    assert re.search("robot_2 (joins|and) robot_1 ", printed)
+    assert [each["name"] for each in json.loads((out / "merge.json").read_text())["maps"]] == ["robot_1", "robot_2"]
+    for robot in ("robot_1", "robot_2"):
+        assert json.loads((out / robot / "report.json").read_text())["runtime"] == "nodes"
+
+
+def test_a_replay_of_several_logs_is_of_a_team(tmp_path, capsys):
+    assert main(["replay", FIRST, SECOND, "--out", str(tmp_path / "out")]) == 2
+    assert "replay takes one log, and 2 are given: give one, or --team" in capsys.readouterr().err
+    assert main(["replay", FIRST, "--team", "--out", str(tmp_path / "out")]) == 2
+    assert "--team maps several logs at once, and one is given" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

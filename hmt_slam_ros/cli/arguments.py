@@ -89,6 +89,17 @@ def _add_map_arguments(command: argparse.ArgumentParser) -> None:
         choices=("mapping", "localization", "lifelong"),
         help="localization leaves the map of --from as it is, lifelong changes it only where the world has",
     )
+    _add_team(command, "run_team")
+    command.add_argument(
+        "--jobs",
+        type=_count,
+        default=len(os.sched_getaffinity(0)),
+        metavar="N",
+        help="OS processes, of which two have work; by default one for each core. The results are the same",
+    )
+
+
+def _add_team(command: argparse.ArgumentParser, function: str) -> None:
     command.add_argument(
         "others", type=Path, nargs="*", metavar="LOG", help="with --team: the logs of the other robots"
     )
@@ -96,15 +107,8 @@ def _add_map_arguments(command: argparse.ArgumentParser) -> None:
         "--team",
         action="store_const",
         dest="function",
-        const="hmt_slam_ros.cli.team_commands:run_team",
+        const=f"hmt_slam_ros.cli.team_commands:{function}",
         help="map several logs at once, each as a robot with an unknown start, and join what shows the same ground",
-    )
-    command.add_argument(
-        "--jobs",
-        type=_count,
-        default=len(os.sched_getaffinity(0)),
-        metavar="N",
-        help="OS processes, of which two have work; by default one for each core. The results are the same",
     )
 
 
@@ -116,6 +120,7 @@ def _count(text: str) -> int:
 
 def _add_replay_arguments(command: argparse.ArgumentParser) -> None:
     _add_log_and_output(command)
+    _add_team(command, "run_team_replay")
     command.add_argument("--rate", type=float, help="speed relative to real time; also --set robot.rate=F")
     command.add_argument(
         "--view",

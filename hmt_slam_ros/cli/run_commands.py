@@ -10,7 +10,9 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +42,7 @@ from hmt_slam_ros.saved_map.folder import HMT_MAP
 
 def run_map(options: argparse.Namespace) -> None:
     """Map the log, write the output folder and print a summary."""
-    if options.others:
-        raise HmtSlamError(f"map takes one log, and {1 + len(options.others)} are given: give one, or --team")
+    check_single_log(options)
     configuration, state, log = _initial_state(options)
     report_left_out(log, options.command)
     check_output(options.out, options.command)
@@ -154,19 +155,50 @@ def finish_measured(
 
 def run_replay(options: argparse.Namespace) -> None:
     """Start the nodes, wait for the end of the log and print a summary."""
+    check_single_log(options)
     configuration = chosen_configuration(options)
     check_output(options.out, options.command)
     log = open_log(options.log, start=configuration.robot.start, duration=configuration.robot.duration or None)
     report_left_out(log, options.command)
-    try:
-        from hmt_slam_ros.ros.replay import replay  # noqa: PLC0415  the only command that needs ROS
-    except ImportError as fault:
-        raise HmtSlamError(f"replay needs ROS ({fault}): source Jazzy or install its wheels, or use map") from fault
-    if options.view is not None:
-        from hmt_slam_ros.view.server import LOCAL, check_port  # noqa: PLC0415  Pillow is for the page alone
-
-        check_port(options.view)
-        print(f"the live page is at http://{LOCAL}:{options.view}/", file=sys.stderr)
+    replay = load_replay().replay
+    announce_page(options.view)
     with Progress(log.scan_count, log.duration) as progress:
         replayed = replay(options.log, options.out, configuration, progress, view_port=options.view)
     print(summary(options.out, replayed.recording, log.duration, replayed.wall_seconds))
+
+
+def check_single_log(options: argparse.Namespace) -> None:
+    """Check that one log is given.
+
+    :raises HmtSlamError: for several.
+    """
+    if options.others:
+        count = 1 + len(options.others)
+        raise HmtSlamError(f"{options.command} takes one log, and {count} are given: give one, or --team")
+
+
+def load_replay(module: str = "replay") -> ModuleType:
+    """The module that replays logs by the nodes, which needs ROS.
+
+    :param module: its name in the package of the nodes.
+    :raises HmtSlamError: where ROS is not installed.
+    """
+    try:
+        return import_module(f"hmt_slam_ros.ros.{module}")
+    except ImportError as fault:
+        raise HmtSlamError(f"replay needs ROS ({fault}): source Jazzy or install its wheels, or use map") from fault
+
+
+def announce_page(port: int | None, count: int = 1) -> None:
+    """Say where the live pages will be, and check their ports.
+
+    :param port: of the first page; the others have the ports after it. None for no page.
+    :raises HmtSlamError: where one is taken.
+    """
+    if port is None:
+        return
+    from hmt_slam_ros.view.server import LOCAL, check_port  # noqa: PLC0415  Pillow is for the page alone
+
+    for own in range(port, port + count):
+        check_port(own)
+        print(f"the live page is at http://{LOCAL}:{own}/", file=sys.stderr)

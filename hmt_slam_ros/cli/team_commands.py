@@ -1,14 +1,16 @@
-"""The command ``map --team``: maps several logs at once, and joins the maps."""
+"""The commands ``map --team`` and ``replay --team``: map several logs at once, and join the maps."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 import time
+from collections.abc import Sequence
+from pathlib import Path
 
 from hmt_slam_ros.cli.arguments import chosen_configuration
-from hmt_slam_ros.cli.run_commands import check_output, finish_measured, open_time_window
-from hmt_slam_ros.cli.terminal import report_left_out, summary
+from hmt_slam_ros.cli.run_commands import announce_page, check_output, finish_measured, load_replay, open_time_window
+from hmt_slam_ros.cli.terminal import Progress, report_left_out, summary
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.team import TeamPlacement
@@ -31,17 +33,42 @@ def run_team(options: argparse.Namespace) -> None:
         for name in logs:
             (folder / name).mkdir()
             writers[name] = map_writer(folder / name)
-        results = TeamRun(configuration, logs, _report).run(lambda name, state: writers[name].write_state(state))
+        results = TeamRun(configuration, logs, _report_at).run(lambda name, state: writers[name].write_state(state))
         for name, log in logs.items():
             final, stamps, figures = finish_measured(log, results[name], configuration, wall, cpu)
             write_output(folder / name, final, stamps, figures, configuration, writers[name])
             print(summary(options.out / name, final.recording, log.duration, figures.wall_seconds))
-        if not configuration.team.uses_ground:
-            robots = read_team([folder / name for name in logs])
-            components = {name: component for robot in robots for name, component in robot.components.items()}
-            team = merge_components(components, configuration)
-            write_merged(folder, robots, team, configuration)
-            print(*map(describe_meeting, team.meetings), sep="\n")
+        _write_team(folder, list(logs), configuration)
+
+
+def run_team_replay(options: argparse.Namespace) -> None:
+    """Replay the logs at once, each by the nodes of a robot; write what :func:`run_team` writes."""
+    configuration, paths = _checked_configuration(options), [options.log, *options.others]
+    logs = {robot_folder(n): path for n, path in enumerate(paths, 1)}
+    replay = load_replay("team_replay").replay_team
+    check_output(options.out, options.command)
+    opened = {name: open_time_window(path, configuration) for name, path in logs.items()}
+    for log in opened.values():
+        report_left_out(log, options.command)
+    announce_page(options.view, len(logs))
+    with atomic_output(options.out) as folder:
+        scans, seconds = sum(log.scan_count for log in opened.values()), max(log.duration for log in opened.values())
+        with Progress(scans, seconds) as progress:
+            results = replay(logs, configuration, folder, progress, options.view, _report)
+        for name, result in results.items():
+            print(summary(options.out / name, result.recording, opened[name].duration, result.wall_seconds))
+        _write_team(folder, list(logs), configuration)
+
+
+def _write_team(folder: Path, robots: Sequence[str], configuration: Configuration) -> None:
+    """Write the map of the team from the folders of its robots, and say what became of each pair."""
+    if configuration.team.uses_ground:
+        return
+    maps = read_team([folder / name for name in robots])
+    components = {name: component for robot in maps for name, component in robot.components.items()}
+    team = merge_components(components, configuration)
+    write_merged(folder, maps, team, configuration)
+    print(*map(describe_meeting, team.meetings), sep="\n")
 
 
 def _checked_configuration(options: argparse.Namespace) -> Configuration:
@@ -51,14 +78,18 @@ def _checked_configuration(options: argparse.Namespace) -> Configuration:
     """
     if not options.others:
         raise HmtSlamError("--team maps several logs at once, and one is given: name another one")
-    if options.source is not None or options.mode is not None:
+    if getattr(options, "source", None) is not None or getattr(options, "mode", None) is not None:
         raise HmtSlamError("--team maps from scratch: leave out --from and --mode")
     return chosen_configuration(options)
 
 
-def _report(seconds: float, placement: TeamPlacement) -> None:
+def _report_at(seconds: float, placement: TeamPlacement) -> None:
+    _report(placement, f"{seconds:.0f} s: ", "map")
+
+
+def _report(placement: TeamPlacement, time_text: str = "", command: str = "replay") -> None:
     """Say what is new on two robots, once."""
     if placement.robot == placement.first:
         names = f"{placement.second} in the map of {placement.first}"
         sure = f"{placement.verdict.value}, probability {placement.probability:.3f}, apart {placement.apart:.3f}"
-        print(f"hmt_slam map: {seconds:.0f} s: {names}: {sure}", file=sys.stderr)
+        print(f"hmt_slam {command}: {time_text}{names}: {sure}", file=sys.stderr)

@@ -13,13 +13,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, String
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.documents import ros_yaml, yaml_value
@@ -27,12 +28,14 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.documents import RobotStatus
+from hmt_slam_ros.messages.gate import decode_of_team
 from hmt_slam_ros.messages.messages import AreaEvents, Message
 from hmt_slam_ros.messages.routing import SUBSCRIPTIONS
 from hmt_slam_ros.messages.system_name import SystemName
+from hmt_slam_ros.messages.team import TeamPlacement
 from hmt_slam_ros.open_log import is_simulated, open_log
 from hmt_slam_ros.process_memory import ResourceUsage
-from hmt_slam_ros.process_table import COORDINATOR, RECORDER, consumer_count, process_names, producer
+from hmt_slam_ros.process_table import COORDINATOR, RECORDER, TEAM, consumer_count, process_names, producer
 from hmt_slam_ros.results.final_map import deskewed_scans, final_map
 from hmt_slam_ros.results.output_folder import RunMetrics, atomic_output, write_output
 from hmt_slam_ros.results.recorder import Recorder, Recording
@@ -43,7 +46,7 @@ from hmt_slam_ros.ros.execution import wait_until_alone
 from hmt_slam_ros.ros.guarded_node import GuardedNode
 from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
 from hmt_slam_ros.ros.node_processes import NodeProcesses, own_domain
-from hmt_slam_ros.ros.topics import COST, DIAGNOSTICS, TFMessage
+from hmt_slam_ros.ros.topics import COST, DIAGNOSTICS, DOCUMENTS, TFMessage
 from hmt_slam_ros.sensors import Scan
 
 STALL_TIMEOUT = 180.0
@@ -70,8 +73,8 @@ class RecorderNode(GuardedNode):
     :ivar fault: sentence of a node about a fault that the run does not survive, None without.
     """
 
-    def __init__(self, configuration: Configuration, context: Context, system: str) -> None:
-        super().__init__(RECORDER.name, context=context)
+    def __init__(self, configuration: Configuration, context: Context, system: str, namespace: str = "") -> None:
+        super().__init__(RECORDER.name, context=context, namespace=namespace)
         self.recorder = Recorder(configuration)
         self.message_count = 0
         self.robot_status: RobotStatus | None = None
@@ -86,6 +89,16 @@ class RecorderNode(GuardedNode):
         subscribe_document(self, RobotStatus, self._on_robot_status, topics.LATCHED)
         self.create_subscription(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, topics.STREAM)
         self.create_subscription(Float64MultiArray, COST, self._on_cost, topics.COST_HISTORY)
+
+    def note_placements(self, robot: str, on_placement: Callable[[TeamPlacement], None]) -> None:
+        """Call ``on_placement`` with each answer of a robot for itself and another one."""
+
+        def on_document(message: String) -> None:
+            placement = decode_of_team(message.data, TeamPlacement)
+            if placement.robot == robot:
+                on_placement(placement)
+
+        self.create_subscription(String, DOCUMENTS[TeamPlacement], on_document, topics.TEAM_HISTORY)
 
     @property
     def is_complete(self) -> bool:
@@ -180,33 +193,10 @@ def replay(
     :param view_port: port of the live page, None for no page.
     :raises HmtSlamError: for an unreadable log, a node that ends, or a run that stalls.
     """
-    if configuration.robot.drive == "commands":
-        raise HmtSlamError("robot.drive = commands is for the robot node alone: set it to log for a replay")
-    if configuration.robot.loop:
-        raise HmtSlamError("robot.loop = true has no end to wait for: set it to false for a replay into a folder")
-    opened = open_log(log, start=configuration.robot.start, duration=configuration.robot.duration or None)
-    if not opened.scan_count:
-        raise HmtSlamError(f"{log} has no scans in the part asked for: check --start and --duration")
-    contents = _read_contents(opened)
-    with atomic_output(output) as folder:
-        run = _ReplayRun(configuration, progress or (lambda _: None), stall_timeout, view_port)
-        run.run(log, _slam_arguments(contents.laser_poses))
-        begin = time.process_time()
-        recording = run.recorder_node.recorder.finish(contents.stamps)
-        final = final_map(recording, partial(deskewed_scans, opened, configuration), configuration)
-        refinement = time.process_time() - begin
-        metrics = RunMetrics(
-            log=opened.name,
-            runtime="nodes",
-            seconds_per_scan=run.recorder_node.seconds_per_scan(contents.stamps),
-            peak_rss={name: usage.peak_rss for name, usage in run.usage.items()},
-            pss={name: usage.pss for name, usage in run.usage.items()},
-            wall_seconds=run.wall_seconds,
-            cpu_seconds=sum(usage.cpu_seconds for usage in run.usage.values()) + refinement,
-            refinement_seconds=refinement,
-        )
-        write_output(folder, final, contents.source_stamps, metrics, configuration)
-    return ReplayResult(final.recording, run.wall_seconds)
+    run = ReplayRun(log, configuration, progress, stall_timeout=stall_timeout, view_port=view_port)
+    with atomic_output(output) as folder, own_domain() as domain:
+        run.run(domain)
+        return run.write(folder)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,8 +233,20 @@ def _slam_arguments(laser_poses: list[list[float]]) -> list[str]:
     return ["-p", f"laser_pose:={laser_poses[0]}"]
 
 
-class _ReplayRun:
-    """One run of the nodes with the recorder.
+@dataclass(frozen=True, eq=False)
+class ReplayTeam:
+    """What the runs of a team share.
+
+    :ivar is_given_up: set where one of them failed.
+    :ivar on_placement: called with each new answer of a robot for itself and another one.
+    """
+
+    is_given_up: Event
+    on_placement: Callable[[TeamPlacement], None]
+
+
+class ReplayRun:
+    """One run of the nodes of a robot with the recorder.
 
     :ivar recorder_node: the recorder's node.
     :ivar usage: {node: resources}.
@@ -256,39 +258,86 @@ class _ReplayRun:
     wall_seconds: float
 
     def __init__(
-        self, configuration: Configuration, progress: Callable[[int], None], stall_timeout: float, view_port: int | None
+        self,
+        log: Path,
+        configuration: Configuration,
+        progress: Callable[[int], None] | None = None,
+        stall_timeout: float = STALL_TIMEOUT,
+        view_port: int | None = None,
+        robot: str = "",
+        team: ReplayTeam | None = None,
     ) -> None:
-        self._configuration, self._progress = configuration, progress
+        """Read the log.
+
+        :param progress: called with the number of processed scans.
+        :param stall_timeout: time without any message after which the run is given up, s.
+        :param view_port: port of the live page, None for no page.
+        :param robot: namespace of the nodes, and name of the robot in its team.
+        :param team: the other robots; None for one alone.
+        :raises HmtSlamError: for an unreadable log, or a configuration without an end.
+        """
+        if configuration.robot.drive == "commands":
+            raise HmtSlamError("robot.drive = commands is for the robot node alone: set it to log for a replay")
+        if configuration.robot.loop:
+            raise HmtSlamError("robot.loop = true has no end to wait for: set it to false for a replay into a folder")
+        self._opened = open_log(log, start=configuration.robot.start, duration=configuration.robot.duration or None)
+        if not self._opened.scan_count:
+            raise HmtSlamError(f"{log} has no scans in the part asked for: check --start and --duration")
+        self._log, self._contents = log, _read_contents(self._opened)
+        self._configuration, self._progress = configuration, progress or (lambda _: None)
         self._stall_timeout, self._view_port = stall_timeout, view_port
+        self._robot, self._team = robot, team
+        self._nodes = process_names() if team is None else (*process_names(), TEAM.name)
         self._system = f"replay-{secrets.token_hex(8)}"
 
-    def run(self, log: Path, slam_settings: list[str]) -> None:
+    def run(self, domain: int) -> None:
         """Start the nodes, record until the end, stop them.
 
-        :param slam_settings: arguments for the node slam.
+        :param domain: id of the DDS domain.
         :raises HmtSlamError: where a node ends or the run stalls.
         """
         with (
             tempfile.TemporaryDirectory(prefix="hmt_slam_replay_") as scratch,
-            own_domain() as domain,
             self._recorder_executor(domain) as executor,
-            NodeProcesses(Path(scratch), (*process_names(), "view"), _print_notice) as children,
+            NodeProcesses(Path(scratch), (*self._nodes, "view"), _print_notice) as children,
         ):
             begin = time.monotonic()
-            self._start_nodes(children, log, slam_settings, domain, Path(scratch))
+            self._start_nodes(children, domain, Path(scratch))
             self._record(executor, children)
             self.wall_seconds = time.monotonic() - begin
             self._await_diagnostics(executor)
             self.usage = {name: used for name, used in children.usage().items() if name != "view"}
 
+    def write(self, folder: Path) -> ReplayResult:
+        """Write the output folder of a run that has ended."""
+        begin = time.process_time()
+        recording = self.recorder_node.recorder.finish(self._contents.stamps)
+        scans = partial(deskewed_scans, self._opened, self._configuration)
+        final = final_map(recording, scans, self._configuration)
+        refinement = time.process_time() - begin
+        metrics = RunMetrics(
+            log=self._opened.name,
+            runtime="nodes",
+            seconds_per_scan=self.recorder_node.seconds_per_scan(self._contents.stamps),
+            peak_rss={name: usage.peak_rss for name, usage in self.usage.items()},
+            pss={name: usage.pss for name, usage in self.usage.items()},
+            wall_seconds=self.wall_seconds,
+            cpu_seconds=sum(usage.cpu_seconds for usage in self.usage.values()) + refinement,
+            refinement_seconds=refinement,
+        )
+        write_output(folder, final, self._contents.source_stamps, metrics, self._configuration)
+        return ReplayResult(final.recording, self.wall_seconds)
+
     @contextmanager
     def _recorder_executor(self, domain: int) -> Iterator[SingleThreadedExecutor]:
         """Executor of the recorder's node, in a context of its own without signal handlers."""
-        with _local_discovery():
+        with local_discovery():
             context = Context()
             context.init(domain_id=domain)
         try:
-            self.recorder_node = RecorderNode(self._configuration, context, self._system)
+            self.recorder_node = RecorderNode(self._configuration, context, self._system, self._robot)
+            if self._team is not None:
+                self.recorder_node.note_placements(self._robot, self._team.on_placement)
             executor = SingleThreadedExecutor(context=context)
             executor.add_node(self.recorder_node)
             try:
@@ -300,25 +349,24 @@ class _ReplayRun:
         finally:
             context.try_shutdown()
 
-    def _start_nodes(
-        self, children: NodeProcesses, log: Path, slam_settings: list[str], domain: int, scratch: Path
-    ) -> None:
+    def _start_nodes(self, children: NodeProcesses, domain: int, scratch: Path) -> None:
         parameters = scratch / "parameters.yaml"
         parameters.write_text(ros_yaml(self._configuration), encoding="utf-8")
         environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), _DISCOVERY_RANGE: "LOCALHOST"}
-        system = ["-p", f"system:={self._system}"]
+        system = ["-p", f"system:={self._system}", *(["-r", f"__ns:=/{self._robot}"] if self._robot else [])]
         if self._view_port is not None:
             children.start("view", ["-p", f"port:={self._view_port}", *system], environment)
         shared = ["--params-file", str(parameters), *system]
         recovery = ["-p", f"recovery:={scratch / 'recovery'}"]
-        for name in process_names():
-            children.start(name, shared + recovery + (slam_settings if name == COORDINATOR else []), environment)
-        own = {
-            "log": yaml_value(str(log if is_simulated(log) else log.absolute())),
+        own = {COORDINATOR: _slam_arguments(self._contents.laser_poses)}
+        for name in self._nodes:
+            children.start(name, shared + recovery + own.get(name, []), environment)
+        values = {
+            "log": yaml_value(str(self._log if is_simulated(self._log) else self._log.absolute())),
             "robot.odometry_listeners": consumer_count("Odometry"),
             "robot.discovery_timeout": _DISCOVERY_TIMEOUT,
         }
-        settings = [word for name, value in own.items() for word in ("-p", f"{name}:={value}")]
+        settings = [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
         children.start("robot", [*shared, *settings], environment)
 
     def _record(self, executor: SingleThreadedExecutor, children: NodeProcesses) -> None:
@@ -338,6 +386,8 @@ class _ReplayRun:
 
     def _check_progress(self, children: NodeProcesses, silence: float) -> None:
         children.restart_killed()
+        if self._team is not None and self._team.is_given_up.is_set():
+            raise HmtSlamError(f"{self._robot} is given up, as another robot of the team was")
         if self.recorder_node.fault is not None and silence > _FAULT_TIMEOUT:
             raise HmtSlamError(self.recorder_node.fault)
         if silence > self._stall_timeout:
@@ -351,7 +401,7 @@ class _ReplayRun:
         """Wait for diagnostics of every process from now on, with the costs of its last messages."""
         begin, deadline = time.time_ns(), time.monotonic() + _DIAGNOSTICS_TIMEOUT
         while time.monotonic() < deadline and any(
-            self.recorder_node.diagnostics_stamps.get(name, 0) < begin for name in process_names()
+            self.recorder_node.diagnostics_stamps.get(name, 0) < begin for name in self._nodes
         ):
             executor.spin_once(timeout_sec=_SPIN)
 
@@ -361,7 +411,7 @@ def _print_notice(sentence: str) -> None:
 
 
 @contextmanager
-def _local_discovery() -> Iterator[None]:
+def local_discovery() -> Iterator[None]:
     """Let contexts that are made inside discover only this computer."""
     before = os.environ.get(_DISCOVERY_RANGE)
     os.environ[_DISCOVERY_RANGE] = "LOCALHOST"
