@@ -6,9 +6,12 @@ import re
 import pytest
 
 from hmt_slam_ros.cli.main import main
+from hmt_slam_ros.hybrid_map.hybrid_map import has_foreign_keyframes
+from hmt_slam_ros.results.hmt_map import read_saved_map
 
 FIRST = "sim:office,size=0.7,seed=51,laps=1"
 SECOND = "sim:office,size=0.7,seed=51,laps=1,visit=1"
+ROBOTS = ("robot_1", "robot_2")
 
 
 def run_map(*arguments):
@@ -17,13 +20,16 @@ def run_map(*arguments):
 
 def test_robots_of_one_building_have_one_map_and_each_its_own(tmp_path, capsys):
     out = tmp_path / "out"
-    assert run_map(FIRST, SECOND, "--team", "--seed", "50", "--duration", "85", "--out", out) == 0
+    words = ("--seed", "50", "--duration", "110", "--set", "team.uses_ground=true")
+    assert run_map(FIRST, SECOND, "--team", *words, "--out", out) == 0
     printed = capsys.readouterr()
     assert re.search(r"robot_2 in the map of robot_1: joined, probability 0\.99\d", printed.err)
     assert re.search(r"robot_2 joins robot_1 with probability \d\.\d{3}, by \d+ places", printed.out)
     report = json.loads((out / "merge.json").read_text())
     assert [len(piece["components"]) for piece in report["pieces"]] == [2]
-    for robot in ("robot_1", "robot_2"):
+    assert any(has_foreign_keyframes(read_saved_map(out / robot / "hmt_map").replica.scans) for robot in ROBOTS)
+    assert sum(each["keyframes"] for each in report["maps"]) == len(read_saved_map(out / "hmt_map").replica.scans)
+    for robot in ROBOTS:
         assert {"hmt_map", "map.png", "report.json", "trajectory.tum"} <= {
             each.name for each in (out / robot).iterdir()
         }
@@ -41,8 +47,8 @@ def test_nodes_of_two_robots_replay_their_logs_at_once(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert len(re.findall(r"robot_[12]: 126 of 126 scans, 0 dropped", printed)) == 2
     assert re.search("robot_2 (joins|and) robot_1 ", printed)
-    assert [each["name"] for each in json.loads((out / "merge.json").read_text())["maps"]] == ["robot_1", "robot_2"]
-    for robot in ("robot_1", "robot_2"):
+    assert [each["name"] for each in json.loads((out / "merge.json").read_text())["maps"]] == list(ROBOTS)
+    for robot in ROBOTS:
         assert json.loads((out / robot / "report.json").read_text())["runtime"] == "nodes"
 
 

@@ -15,7 +15,7 @@ from hmt_slam_ros.messages.messages import Notice
 from hmt_slam_ros.results import final_map as results_final_map
 from hmt_slam_ros.results.final_map import final_map
 from hmt_slam_ros.results.recorder import Recorder, Recording, keyframe_poses
-from hmt_slam_ros.results.trajectories import trajectory_in_map
+from hmt_slam_ros.results.trajectories import RelativeTrajectory, trajectory_in_map
 from hmt_slam_ros.results.trajectory_nodes import select_nodes
 from hmt_slam_ros.sensors import Scan
 
@@ -137,3 +137,46 @@ def test_a_notice_names_an_arc_that_was_left_by_more_than_it_allows(monkeypatch:
     assert notice.text.startswith("area 1 moved by 0.30 m and 0.0 degrees as seen from area 0, more than their arc")
     allowed = with_arc(right, np.array([0.3, 0.0, 0.0]), np.diag([0.2, 0.05, 0.02]) ** 2)
     assert refined_arc(allowed, recorder.configuration)[1] == ()
+
+
+def with_foreign_area(recording: Recording) -> Recording:
+    """The recording with an area of another robot beside area 1, to which its last scans are relative."""
+    hybrid_map, covariance = recording.hybrid_map.branch(), 1e-4 * np.eye(3)
+    scans = dict(recording.replica.scans)
+    for number, keyframe in enumerate((-2, -3)):
+        hybrid_map.set_keyframe(keyframe, 9, np.array([0.1 * number, 0.0, 0.0]))
+        scans[keyframe] = room_scan(SCANS - 1)
+    beside = PoseGaussian(np.array([0.3, 0.2, 0.5]), covariance)
+    hybrid_map.set_arc(1, 9, beside, closure=True)
+    area_poses = recording.area_poses | {9: recording.area_poses[1].compose(beside)}
+    poses, relative = keyframe_poses(hybrid_map, area_poses), recording.relative_trajectory
+    keyframes, offsets = relative.keyframes.copy(), relative.poses.copy()
+    keyframes[-3:], offsets[-3:] = -2, se2.between(poses[-2], recording.trajectory[-3:])
+    replica = replace(
+        recording.replica, scans=scans, maps=recording.replica.maps | {recording.replica.best_hypothesis: hybrid_map}
+    )
+    return replace(
+        recording,
+        replica=replica,
+        area_poses=area_poses,
+        relative_trajectory=RelativeTrajectory(keyframes, offsets),
+    )
+
+
+def test_the_ground_of_another_robot_moves_with_that_of_its_own() -> None:
+    recorder = make_recorder()
+    recording = with_arc(room_recording(recorder), np.array([0.1, 0.05, 0.02]), np.diag([0.2, 0.2, 0.05]) ** 2)
+    alone = final_map(recording, room_scans, recorder.configuration).recording
+    whole = with_foreign_area(recording)
+    found = final_map(whole, room_scans, recorder.configuration).recording
+    for keyframe in (0, 1):
+        own, expected = (each.hybrid_map.keyframes(0)[keyframe] for each in (found, alone))
+        np.testing.assert_allclose(own, expected, atol=1e-9)
+    np.testing.assert_allclose(found.trajectory, alone.trajectory, atol=1e-9)
+    assert not np.allclose(found.area_poses[1].mean, recording.area_poses[1].mean, atol=0.01)
+    before, after = (se2.between(poses[1].mean, poses[9].mean) for poses in (whole.area_poses, found.area_poses))
+    np.testing.assert_allclose(after, before, atol=1e-9)
+    arc = found.hybrid_map.arc(1, 9)
+    assert arc is not None
+    np.testing.assert_allclose(arc.mean, after, atol=1e-9)
+    assert set(found.relative_trajectory.keyframes.tolist()) <= set(alone.replica.scans)

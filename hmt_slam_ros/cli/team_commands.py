@@ -62,8 +62,6 @@ def run_team_replay(options: argparse.Namespace) -> None:
 
 def _write_team(folder: Path, robots: Sequence[str], configuration: Configuration) -> None:
     """Write the map of the team from the folders of its robots, and say what became of each pair."""
-    if configuration.team.uses_ground:
-        return
     maps = read_team([folder / name for name in robots])
     components = {name: component for robot in maps for name, component in robot.components.items()}
     team = merge_components(components, configuration)

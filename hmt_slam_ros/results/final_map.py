@@ -38,6 +38,7 @@ from hmt_slam_ros.registration.scan_to_scan import (
     normal_equations,
     weighting_from_options,
 )
+from hmt_slam_ros.results.own_recording import with_foreign_ground, with_map, without_foreign_ground
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses
 from hmt_slam_ros.results.trajectories import Trajectory, trajectory_in_map
 from hmt_slam_ros.results.trajectory_nodes import follow_nodes, motion_edges, node_scans, select_nodes
@@ -139,15 +140,17 @@ def final_map(recording: Recording, scans: Callable[[], Iterable[Scan]], configu
     stages = {"filter": open_loop, "arcs": recording.trajectory}
     if not configuration.refinement.iterations or configuration.mode == "localization":
         return FinalMap(recording, stages)
-    refinement = _TrajectoryRefinement(recording, scans(), configuration)
-    refined = refinement.refined_recording(recording)
-    refined = replace(refined, notices=recording.notices + _inconsistent_arcs(recording.hybrid_map, refined.hybrid_map))
+    own = without_foreign_ground(recording)
+    refinement = _TrajectoryRefinement(own, scans(), configuration)
+    refined = refinement.refined_recording(own)
+    refined = replace(refined, notices=recording.notices + _inconsistent_arcs(own.hybrid_map, refined.hybrid_map))
     stages["keyframes"] = refined.trajectory
     trajectory = refinement.registered_trajectory(refined, scans())
     relative = refined.relative_trajectory.with_trajectory(
         trajectory, keyframe_poses(refined.hybrid_map, refined.area_poses)
     )
-    return FinalMap(replace(refined, trajectory=trajectory, relative_trajectory=relative), stages)
+    refined = replace(refined, trajectory=trajectory, relative_trajectory=relative)
+    return FinalMap(refined if own is recording else with_foreign_ground(refined, recording), stages)
 
 
 class _TrajectoryRefinement:
@@ -248,10 +251,8 @@ def _with_keyframe_poses(recording: Recording, poses: Mapping[int, NDArray[np.fl
     for a, b, arc in list(hybrid_map.all_arcs()):
         mean = se2.between(area_poses[a].mean, area_poses[b].mean)
         hybrid_map.set_arc(a, b, PoseGaussian(mean, arc.pose.covariance), closure=arc.closure)
-    replica = replace(recording.replica, maps=recording.replica.maps | {recording.replica.best_hypothesis: hybrid_map})
     return replace(
-        recording,
-        replica=replica,
+        with_map(recording, hybrid_map),
         area_poses=area_poses,
         trajectory=trajectory_in_map(recording.relative_trajectory, poses),
     )

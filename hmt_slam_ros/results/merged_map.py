@@ -28,6 +28,7 @@ from hmt_slam_ros.results.output_folder import MERGE_REPORT, TEAM_PICTURE, map_w
 from hmt_slam_ros.results.recorder import keyframe_poses
 from hmt_slam_ros.results.trajectories import RelativeTrajectory, Trajectory, trajectory_in_map
 from hmt_slam_ros.team.components import Component
+from hmt_slam_ros.team.own_ground import own_ground
 from hmt_slam_ros.team.placement import Placement
 from hmt_slam_ros.team.team_map import Piece, PieceMeeting, TeamMap, split_component
 
@@ -41,17 +42,16 @@ class RobotMap:
 
     :ivar name: of its folder.
     :ivar saved: the map.
+    :ivar hybrid_map: of its most probable hypothesis, without ground of other robots.
+    :ivar relative_trajectory: of the scans, relative to keyframes of that ground.
     :ivar components: {name: piece of it that arcs hold together}.
     """
 
     name: str
     saved: SavedMap
+    hybrid_map: HybridMap
+    relative_trajectory: RelativeTrajectory
     components: dict[str, Component]
-
-    @property
-    def hybrid_map(self) -> HybridMap:
-        """The map of the most probable hypothesis."""
-        return self.saved.replica.maps[self.saved.replica.best_hypothesis]
 
 
 def read_team(paths: Sequence[Path]) -> list[RobotMap]:
@@ -80,13 +80,21 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 def _read_robot(path: Path, name: str) -> RobotMap:
     saved = read_saved_map(map_folder(path))
-    hybrid_map = saved.replica.maps[saved.replica.best_hypothesis]
-    if not any(hybrid_map.keyframes(area) for area in hybrid_map.area_ids()):
-        raise HmtSlamError(f"{path} has no keyframes to join another map by: leave it out")
+    whole = saved.replica.maps[saved.replica.best_hypothesis]
+    relative = saved.relative_trajectory
     if has_foreign_keyframes(saved.replica.scans):
-        raise HmtSlamError(f"{path} has ground of another robot: give maps that were made with team.uses_ground=false")
-    whole = Component.of_map(hybrid_map, saved.replica.scans, read_clutter(map_folder(path)))
-    return RobotMap(name, saved, split_component(name, whole))
+        hybrid_map = own_ground(whole)
+        relative = relative.relative_to(_keyframes(hybrid_map), keyframe_poses(whole, consistent_map(whole).poses))
+    else:
+        hybrid_map = whole
+    if not _keyframes(hybrid_map):
+        raise HmtSlamError(f"{path} has no keyframes to join another map by: leave it out")
+    component = Component.of_map(hybrid_map, saved.replica.scans, read_clutter(map_folder(path)))
+    return RobotMap(name, saved, hybrid_map, relative, split_component(name, component))
+
+
+def _keyframes(hybrid_map: HybridMap) -> list[int]:
+    return [keyframe for area in hybrid_map.area_ids() for keyframe in hybrid_map.keyframes(area)]
 
 
 def _check_pair(one: RobotMap, other: RobotMap) -> None:
@@ -102,7 +110,8 @@ def _check_pair(one: RobotMap, other: RobotMap) -> None:
 
 
 def _scan_keys(robot: RobotMap) -> set[tuple[int, bytes]]:
-    return {(scan.stamp, scan.ranges.tobytes()) for scan in robot.saved.replica.scans.values()}
+    scans = [scan for component in robot.components.values() for scan in component.scans.values()]
+    return {(scan.stamp, scan.ranges.tobytes()) for scan in scans}
 
 
 def write_merged(directory: Path, robots: Sequence[RobotMap], team: TeamMap, configuration: Configuration) -> None:
@@ -164,7 +173,7 @@ def _trajectories(robots: Sequence[RobotMap], whole: Piece) -> tuple[RelativeTra
     """The scans of all robots relative to the keyframes of the whole map, and the first of each robot."""
     keyframes, poses, starts = [np.zeros(0, np.int64)], [np.zeros((0, 3))], list[int]()
     for robot in robots:
-        own = robot.saved.relative_trajectory
+        own = robot.relative_trajectory
         starts.append(sum(map(len, keyframes)))
         numbers = own.keyframes.copy()
         for name, component in robot.components.items():
@@ -187,8 +196,9 @@ def _path(
 
 def _replica(robot: RobotMap, whole: Piece) -> Replica:
     """The whole map as the only hypothesis, with a robot in the area where the first one was at last."""
-    replica = robot.saved.replica
-    area = replica.robot_areas[replica.best_hypothesis]
+    area = robot.saved.replica.robot_areas[robot.saved.replica.best_hypothesis]
+    if not robot.hybrid_map.has_area(area):  # of another robot
+        area = max(robot.hybrid_map.area_ids(), key=lambda own: max(robot.hybrid_map.keyframes(own), default=-1))
     own = next(name for name, component in robot.components.items() if component.hybrid_map.has_area(area))
     return Replica(
         dict(whole.component.scans),

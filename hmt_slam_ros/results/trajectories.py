@@ -34,6 +34,21 @@ class RelativeTrajectory(NamedTuple):
         """The trajectory of no scan."""
         return cls(np.zeros(0, np.int64), np.zeros((0, 3)))
 
+    def relative_to(self, kept: Collection[int], poses: Mapping[int, Float64]) -> RelativeTrajectory:
+        """The trajectory relative to some of the keyframes: others give way to the nearest of these.
+
+        :param kept: at least one.
+        :param poses: {keyframe: ``map_T_base``, shape (3,)} of these and of all that the scans are relative to.
+        """
+        keyframes, relative = self.keyframes.copy(), self.poses.copy()
+        numbers = np.array(sorted(kept), dtype=np.int64)
+        there = np.array([poses[keyframe] for keyframe in numbers.tolist()])
+        for row in np.flatnonzero((keyframes != NO_KEYFRAME) & ~np.isin(keyframes, numbers)):
+            pose = se2.compose(poses[int(keyframes[row])], relative[row])
+            nearest = int(np.argmin(np.hypot(*(there - pose)[:, :2].T)))
+            keyframes[row], relative[row] = numbers[nearest], se2.between(there[nearest], pose)
+        return RelativeTrajectory(keyframes, relative)
+
     def replace_start(self, better: RelativeTrajectory, known: Collection[int]) -> RelativeTrajectory:
         """The trajectory with the poses of its first scans taken from another one.
 
