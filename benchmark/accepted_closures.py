@@ -107,8 +107,10 @@ class EventWatch:
             dict(hybrid_map.keyframes(area)) if hybrid_map.has_area(area) else {}
             for area in (closure.far, closure.near)
         )
-        hypotheses = run.recorder.hypotheses[decision.sequence].hypotheses
-        probability = next(one.probability for one in hypotheses if one.id == decision.hypothesis)
+        tlca = run.lock_step.processes["tlca"]
+        assert isinstance(tlca, Tlca)
+        assert decision.hypothesis is not None
+        probability = tlca.supports[decision.hypothesis]
         arc = hybrid_map.arc(closure.far, closure.near) if known and other else None
         placement, found = arc or closure.pose.inverse(), self._placed[closure.closure_id]
         query = {}

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.hybrid_map.hypothesis_agreement import LocalizedHypothesis, elsewhere_probability
 from hmt_slam_ros.metric_slam.slam import MetricSlam
 from hmt_slam_ros.offline.lock_step import LockStepRun
-from hmt_slam_ros.topological_inference.hypothesis_agreement import LocalizedHypothesis, elsewhere_probability
 
 
 class RobotPose(NamedTuple):

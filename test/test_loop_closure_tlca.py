@@ -1,12 +1,15 @@
 """Topological Loop Closure Acceptance: which path becomes definite, and when."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import worlds
-from play_for_tlca import HOME, SPREAD, WORLD, Play, new_area, poses_of
+from play_for_tlca import HOME, SPREAD, WORLD, Play, belief, new_area, poses_of
 
 from hmt_slam_ros.loop_closure.tlca import Tlca
 from hmt_slam_ros.messages.documents import encode
+from hmt_slam_ros.messages.map_changes import Arc
 from hmt_slam_ros.messages.messages import AreaEvents, Hypothesis
 
 
@@ -153,3 +156,40 @@ def test_it_goes_on_with_the_same_ambiguities_from_its_state():
     for one in (play, again):
         one.step(*both(0.6), travelled=2.5)
     assert encode(play.ambiguities[-1]) == encode(again.ambiguities[-1])
+
+
+FAR = belief([30.0, 0.0, 0.0], np.diag([3.0, 3.0, 0.2]) ** 2)
+
+
+def close_loops(play, weak):
+    """Areas 0 to 4 in a row, of vague distances; the robot comes from 4 into 0 again, and one path also joins 2 and 4.
+
+    :param weak: probability of the path without that.
+    """
+    play.start()
+    for area in range(1, 5):
+        arc = Arc(area - 1, area, FAR)
+        play.step(Hypothesis(0, 0, 1.0, area, belief(-FAR.mean), (), (arc,)))
+    closing, further = (
+        Arc(4, 0, belief([1.0, 0.0, 0.0]), closure=True),
+        Arc(2, 4, belief([60.0, 0.0, 0.0]), closure=True),
+    )
+    weaker = Hypothesis(1, 0, weak, 0, belief([-1.0, 0.0, 0.0]), (), (closing,))
+    return play.step(weaker, replace(weaker, id=2, probability=1.0 - weak, arcs=(closing, further)))
+
+
+def test_a_path_is_accepted_with_those_that_close_more_loops_far_from_the_robot():
+    play = Play(accept_distance=0.0)
+    assert close_loops(play, 0.2).hypothesis is None
+    both = Hypothesis(1, 1, 0.2, 0), Hypothesis(2, 2, 0.8, 0)
+    verdicts = [play.step(*both) for _ in range(2)]
+    assert [verdict.hypothesis for verdict in verdicts] == [None, 1]
+    assert play.process.supports == {1: pytest.approx(1.0), 2: pytest.approx(0.8)}
+    assert {(arc.source, arc.target) for arc in verdicts[-1].arcs if arc.closure} == {(4, 0)}
+
+
+def test_a_path_that_closes_more_loops_and_dominates_is_accepted_by_itself():
+    play = Play(accept_distance=0.0)
+    close_loops(play, 0.05)
+    both = Hypothesis(1, 1, 0.05, 0), Hypothesis(2, 2, 0.95, 0)
+    assert [play.step(*both).hypothesis for _ in range(2)] == [None, 2]

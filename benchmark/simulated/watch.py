@@ -30,6 +30,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.loop_closure.tlca import Tlca
 from hmt_slam_ros.messages.messages import ClosureDecision, EndOfLog, Hypotheses, Keyframe, Message, RealTimePose
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
 from hmt_slam_ros.messages.routing import Process
@@ -92,12 +93,13 @@ class Watch:
         self._examinations: dict[int, Examination] = {}
         self._area_poses: dict[int, PoseGaussian] = {}
         self._next_pose = 0
+        self._tlca = Tlca(self.configuration)
 
     def run(self) -> None:
         """Map the whole log."""
         configuration = self.configuration
         processes: dict[str, Process] = {row.name: row.make(configuration) for row in PROCESSES}
-        processes["tsbi"] = Tsbi(configuration, self.branching)
+        processes |= {"tsbi": Tsbi(configuration, self.branching), "tlca": self._tlca}
         lock_step = LockStep({name: _ObservedProcess(process, self._on_message) for name, process in processes.items()})
         for record in self.log.records():
             lock_step.feed(record.measurement)
@@ -170,15 +172,14 @@ class Watch:
         self.pmf.append(position | {"unexamined": hypotheses.unexamined, "hypotheses": entries})
 
     def _add_decision(self, decision: ClosureDecision) -> None:
-        probabilities = dict(self._replica.probabilities)
         self._replica.apply_decision(decision)
         if decision.global_poses:
             self._area_poses = {area.area: area.pose for area in decision.global_poses}
         if decision.hypothesis is None:
             return
-        chosen = self._replica.maps[decision.hypothesis]
+        probability, chosen = self._tlca.supports[decision.hypothesis], self._replica.maps[decision.hypothesis]
         for closure in self._paths.take_accepted(decision.hypothesis, chosen):
-            self.accepted.append(self._closure_entry(closure, decision.sequence, probabilities[decision.hypothesis]))
+            self.accepted.append(self._closure_entry(closure, decision.sequence, probability))
         self.loops.update_definite(decision.sequence, chosen, self._replica.robot_areas[decision.hypothesis])
 
     def best_map(self) -> tuple[HybridMap, Mapping[int, Scan]]:

@@ -13,8 +13,10 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import chi_square_gate
 from hmt_slam_ros.hybrid_map.hybrid_map import AreaPair, HybridMap
+from hmt_slam_ros.hybrid_map.hypothesis_agreement import LocalizedHypothesis, supports
 from hmt_slam_ros.hybrid_map.pose_graph import consistent_map, shortest_path_map
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
+from hmt_slam_ros.hybrid_map.surroundings import Neighborhood, areas_around
 from hmt_slam_ros.loop_closure.acceptance import Acceptance, PendingArc, pending_arc
 from hmt_slam_ros.loop_closure.closure_history import (
     AcceptedPath,
@@ -151,9 +153,12 @@ class TlcaState:
 class Tlca:
     """Answers every ``Hypotheses`` with a ``ClosureDecision``, and with an ``Ambiguity`` while several are probable.
 
-    A path is accepted when it has dominated for some keyframes and meters since it branched off, and at once when no
-    other is left. Then the others are dropped, the areas that it joined are aligned, and arcs are fused with earlier
-    traversals. If accepted closures contradict each other, TSBI decides between explanations.
+    A path is accepted when it has dominated for some keyframes and meters since it branched off, alone or together with
+    paths that close more loops far from the robot, and at once when no other is left. Then the others are dropped, the
+    areas that it joined are aligned, and arcs are fused with earlier traversals. If accepted closures contradict each
+    other, TSBI decides between explanations.
+
+    :ivar supports: {hypothesis: probability of what it states, at the last event}.
     """
 
     def __init__(self, configuration: Configuration, state: TlcaState | None = None) -> None:
@@ -166,11 +171,13 @@ class Tlca:
         self._closure_revision = ClosureRevision(self._options, state.closure_revision)
         self._ambiguity = PoseAmbiguity(state.area_frames)
         self._disambiguation = Disambiguation(configuration)
+        self._neighborhood = Neighborhood(configuration.tsbi.local_sigma, configuration.tsbi.local_reach)
         # Without the three parts above, which change in place.
         self._state = replace(state, replica=ReplicaState(), closure_revision=ClosureRevisionState(), area_frames={})
         # TSBI's probabilities are not trusted beyond the configured risk.
         self._min_false_probability = max(1.0 - self._options.accept_probability, _MIN_FALSE_PROBABILITY)
         self._new_closures: frozenset[ClosureId] = frozenset()
+        self.supports: dict[int, float] = {}
         self._is_mapping, self._looks_are_due = True, False
 
     @property
@@ -203,6 +210,8 @@ class Tlca:
         paths = {h.id: self._updated_path(h, hypotheses.sequence) for h in hypotheses.hypotheses}
         poses = {h.id: _rebase_pose(self._state.poses[h.parent], h) for h in hypotheses.hypotheses}
         self._replica.apply_hypotheses(hypotheses)
+        self.supports = self._supported_probabilities(poses)
+        paths = {h: self._count_dominance(path, self.supports[h]) for h, path in paths.items()}
         self._state, self._new_closures = replace(self._state, paths=paths, poses=poses), frozenset()
         ground = self._take_over_ground(hypotheses)
         definite = self._dominant_hypothesis()
@@ -246,6 +255,26 @@ class Tlca:
         )
         return taken
 
+    def _supported_probabilities(self, poses: Mapping[int, Float64]) -> dict[int, float]:
+        """{hypothesis: probability of what it states}; it leaves open what closures far from the robot others have.
+
+        :param poses: {hypothesis: ``area_T_base`` in the hypothesis's area}.
+        """
+        maps, probabilities = self._replica.maps, self._replica.probabilities
+        dominance = self._options.accept_probability
+        if len(maps) == 1 or max(probabilities.values()) >= dominance:
+            return dict(probabilities)
+        hypotheses = {}
+        for hypothesis, hybrid_map in maps.items():
+            area = self._replica.robot_areas[hypothesis]
+            nearby = areas_around(hybrid_map, area, self._neighborhood)
+            hypotheses[hypothesis] = LocalizedHypothesis(hybrid_map, area, poses[hypothesis], nearby)
+        return supports(hypotheses, probabilities, dominance)
+
+    def _count_dominance(self, path: TopologicalPath, support: float) -> TopologicalPath:
+        dominates = support >= self._options.accept_probability
+        return replace(path, dominant_keyframes=path.dominant_keyframes + 1 if dominates else 0)
+
     def _changed_ambiguity(
         self, sequence: int, before: frozenset[tuple[int, bool]], poses: Mapping[int, Float64]
     ) -> list[Message]:
@@ -276,8 +305,6 @@ class Tlca:
         path, area_before = self._state.paths[hypothesis.parent], self._replica.robot_areas[hypothesis.parent]
         if hypothesis.id != hypothesis.parent:
             path = replace(path, branched_at=self._state.path_length, dominant_keyframes=0)
-        dominates = hypothesis.probability >= self._options.accept_probability
-        path = replace(path, dominant_keyframes=path.dominant_keyframes + 1 if dominates else 0)
         if hypothesis.arcs or hypothesis.moved_keyframes or hypothesis.removed_arcs or hypothesis.area_merge:
             path = replace(path, version=self._count_change(), is_definite=False)
         elif hypothesis.frame_change:
@@ -300,14 +327,16 @@ class Tlca:
         return replace(path, pending_arcs=path.pending_arcs + pending)
 
     def _dominant_hypothesis(self) -> int | None:
-        """The hypothesis that becomes definite now, if any."""
-        best = self._replica.best_hypothesis
-        path = self._state.paths[best]
-        if len(self._state.paths) == 1:
-            return None if path.is_definite else best
+        """The hypothesis that becomes definite now, if any; of several the most probable."""
+        paths, best = self._state.paths, self._replica.best_hypothesis
+        if len(paths) == 1:
+            return None if paths[best].is_definite else best
+        lasting = [h for h, path in paths.items() if self._has_dominated(path)]
+        return max(lasting, key=lambda h: (self._replica.probabilities[h], -h), default=None)
+
+    def _has_dominated(self, path: TopologicalPath) -> bool:
         has_lasted = path.dominant_keyframes >= self._options.accept_keyframes
-        distance = self._state.path_length - path.branched_at
-        return best if has_lasted and distance >= self._options.accept_distance else None
+        return has_lasted and self._state.path_length - path.branched_at >= self._options.accept_distance
 
     def _accept_path(self, hypothesis: int) -> tuple[tuple[Arc, ...], tuple[MovedKeyframe, ...]]:
         """The definite arcs and moved keyframes of an accepted path; changes its map."""
@@ -325,7 +354,7 @@ class Tlca:
             is_definite=True,
             pending_arcs=(),
             arc_keyframes=result.arc_keyframes,
-            closures=self._accepted_closures(path, self._replica.probabilities[hypothesis], snapshot),
+            closures=self._accepted_closures(path, self.supports[hypothesis], snapshot),
         )
         self._state = replace(self._state, paths={**self._state.paths, hypothesis: accepted})
         return tuple(result.arcs.values()), tuple(result.moved_keyframes)

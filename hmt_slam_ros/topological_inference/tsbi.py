@@ -13,6 +13,11 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.hybrid_map.hypothesis_agreement import (
+    LocalizedHypothesis,
+    elsewhere_probability,
+    merge_equivalent,
+)
 from hmt_slam_ros.hybrid_map.surroundings import areas_around, consistent_pose
 from hmt_slam_ros.messages.map_changes import AreaPose, LocalArea
 from hmt_slam_ros.messages.messages import (
@@ -31,11 +36,6 @@ from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.branching import Branching, BranchingState
 from hmt_slam_ros.topological_inference.closure_search import known_ground_log_ratio
-from hmt_slam_ros.topological_inference.hypothesis_agreement import (
-    LocalizedHypothesis,
-    elsewhere_probability,
-    merge_equivalent,
-)
 from hmt_slam_ros.topological_inference.hypothesis_changes import apply_revision, merge_areas
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     HypothesisState,
@@ -118,7 +118,6 @@ class Tsbi:
         """
         state = state or TsbiState()
         self._options = configuration.tsbi
-        self._dominance = configuration.tlca.accept_probability
         self._seed = configuration.seed
         self._replica = Replica.from_state(state.replica)
         self._branching = branching(configuration, self._replica)
@@ -288,7 +287,7 @@ class Tsbi:
             LocalizedHypothesis(p.hybrid_map, p.area, pose, {p.area, *p.local_area_poses()})
             for p, pose in zip(parents, poses, strict=True)
         ]
-        log_weights = merge_equivalent(localized, [parent.log_weight for parent in parents], self._dominance)
+        log_weights = merge_equivalent(localized, [parent.log_weight for parent in parents])
         return [replace(parents[n], log_weight=log_weight) for n, log_weight in sorted(log_weights.items())]
 
     def _parent(self, hypothesis: int) -> Parent:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
@@ -167,35 +166,32 @@ class LocalizedHypothesis:
         return is_near and abs(float(difference[2])) <= _SAME_ANGLE
 
 
-def merge_equivalent(
-    hypotheses: Sequence[LocalizedHypothesis], log_weights: Sequence[float], dominance: float
-) -> dict[int, float]:
-    """{number of a hypothesis: log of the weight of all that it represents}.
-
-    The heaviest represents all equivalent ones. Of two that no scan here can tell apart, that which leaves open what
-    the other closes represents both, unless the other one dominates it.
-
-    :param dominance: share of the weight of both from which on a hypothesis dominates another.
-    """
+def merge_equivalent(hypotheses: Sequence[LocalizedHypothesis], log_weights: Sequence[float]) -> dict[int, float]:
+    """{number of a hypothesis: log of the weight of all equivalent ones}, the heaviest of each first."""
     merged: dict[int, float] = {}
     for number in sorted(range(len(hypotheses)), key=lambda n: (-log_weights[n], n)):
         same = next((kept for kept in merged if hypotheses[kept].is_equivalent(hypotheses[number])), number)
         merged[same] = float(np.logaddexp(merged.get(same, -math.inf), log_weights[number]))
-    _merge_into_open(hypotheses, merged, float(scipy.special.logit(dominance)))
     return merged
 
 
-def _merge_into_open(hypotheses: Sequence[LocalizedHypothesis], merged: dict[int, float], log_odds: float) -> None:
-    """Merge each hypothesis into the heaviest that leaves its closures open, below these log-odds to that."""
-    for number in list(merged):
-        weaker = {
-            kept: log_weight
-            for kept, log_weight in merged.items()
-            if merged[number] - log_weight < log_odds and hypotheses[kept].leaves_open(hypotheses[number])
-        }
-        if weaker:
-            heaviest = max(weaker, key=lambda kept: weaker[kept])
-            merged[heaviest] = float(np.logaddexp(weaker[heaviest], merged.pop(number)))
+def supports(
+    hypotheses: Mapping[int, LocalizedHypothesis], probabilities: Mapping[int, float], dominance: float
+) -> dict[int, float]:
+    """{hypothesis: probability of what it states}: its own, and that of those whose further closures it leaves open.
+
+    :param dominance: share of the probability of two hypotheses from which on one is left to itself.
+    """
+    return {
+        one: probabilities[one]
+        + sum(
+            probabilities[other]
+            for other, further in hypotheses.items()
+            if probabilities[other] < dominance * (probabilities[one] + probabilities[other])
+            and hypothesis.leaves_open(further)
+        )
+        for one, hypothesis in hypotheses.items()
+    }
 
 
 def elsewhere_probability(hypotheses: Sequence[LocalizedHypothesis], probabilities: Sequence[float]) -> float:

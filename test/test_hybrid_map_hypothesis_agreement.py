@@ -6,10 +6,11 @@ import pytest
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.topological_inference.hypothesis_agreement import (
+from hmt_slam_ros.hybrid_map.hypothesis_agreement import (
     LocalizedHypothesis,
     elsewhere_probability,
     merge_equivalent,
+    supports,
 )
 
 SHARP, VAGUE = np.diag([0.05, 0.05, 0.01]) ** 2, np.diag([2.0, 2.0, 0.2]) ** 2
@@ -115,7 +116,7 @@ def test_uncertain_poses_imply_no_closure():
 def test_the_heaviest_represents_all_equivalent_ones():
     hypotheses = [enter_known_area(0, POSE), enter_known_area(1, POSE), enter_known_area(0, POSE + 0.01)]
     weights = np.log([0.2, 0.3, 0.5])
-    found = merge_equivalent(hypotheses, weights, DOMINANCE)
+    found = merge_equivalent(hypotheses, weights)
     assert list(found) == [2, 1]
     np.testing.assert_allclose(np.exp(list(found.values())), [0.7, 0.3])
 
@@ -126,22 +127,24 @@ def with_remote_loop(hypothesis):
     return hypothesis
 
 
-@pytest.mark.parametrize(("probabilities", "kept"), [([0.15, 0.85], {0: 1.0}), ([0.005, 0.995], {0: 0.005, 1: 0.995})])
-def test_of_two_that_no_scan_here_tells_apart_the_one_that_leaves_a_loop_open_represents_both(probabilities, kept):
+@pytest.mark.parametrize(
+    ("probabilities", "supported"), [([0.15, 0.85], [1.0, 0.85]), ([0.005, 0.995], [0.005, 0.995])]
+)
+def test_a_hypothesis_has_the_support_of_those_whose_loops_elsewhere_it_leaves_open(probabilities, supported):
     hypotheses = [enter_known_area(0, POSE), with_remote_loop(enter_known_area(0, POSE))]
     assert hypotheses[0].leaves_open(hypotheses[1])
     assert not hypotheses[1].leaves_open(hypotheses[0])
-    found = merge_equivalent(hypotheses, np.log(probabilities), DOMINANCE)
-    assert {n: pytest.approx(np.exp(weight)) for n, weight in found.items()} == kept
+    found = supports(dict(enumerate(hypotheses)), dict(enumerate(probabilities)), DOMINANCE)
+    assert list(found.values()) == pytest.approx(supported)
 
 
 def test_a_loop_beside_the_robot_is_not_left_open():
     hypotheses = [enter_known_area(0, POSE), with_another_loop(enter_known_area(0, POSE))]
     assert not hypotheses[0].leaves_open(hypotheses[1])
-    assert len(merge_equivalent(hypotheses, np.log([0.5, 0.5]), DOMINANCE)) == 2
+    assert supports(dict(enumerate(hypotheses)), {0: 0.5, 1: 0.5}, DOMINANCE) == {0: 0.5, 1: 0.5}
 
 
-def test_a_hypothesis_without_a_loop_does_not_represent_one_that_closes_some():
+def test_a_hypothesis_without_a_loop_has_no_support_of_one_that_closes_some():
     tracked, closed = (LocalizedHypothesis(chain(VAGUE), 0, POSE, {0}) for _ in range(2))
     assert not tracked.leaves_open(with_remote_loop(closed))
 
