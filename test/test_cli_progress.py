@@ -59,6 +59,17 @@ def test_minutes_are_distinct() -> None:
     assert run(tty=False, seconds_per_scan=5.0, scans=20).startswith("2/20 scans, 2.0 x real time, 1 min 30 s left")
 
 
+def test_the_time_left_does_not_count_what_came_before_the_first_scan() -> None:
+    stream, clock = Stream(tty=False), Clock()
+    with Progress(100, log_seconds=200.0, stream=stream, clock=clock) as progress:
+        clock.now += 40.0  # kernels are compiled
+        progress(0)
+        for done in range(1, 31):
+            clock.now += 0.5
+            progress(done)
+    assert stream.getvalue().splitlines() == ["0/100 scans, starting", "20/100 scans, 4.0 x real time, 40 s left"]
+
+
 @pytest.mark.parametrize("tty", [False, True])
 def test_a_log_without_scans_or_time_divides_by_nothing(tty: bool) -> None:
     stream = Stream(tty)

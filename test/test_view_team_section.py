@@ -1,15 +1,11 @@
-"""The robots of a team on the live page, without ROS; the page itself in a real browser."""
+"""The robots of a team on the live page, without ROS and without a browser."""
 
 import json
-import time
 
 import numpy as np
 import pytest
-from browser import Browser, find_browser
 
 from hmt_slam_ros.messages.team import TeamPlacement, Verdict
-from hmt_slam_ros.view.board import Board
-from hmt_slam_ros.view.server import PageServer, grid_png
 from hmt_slam_ros.view.team_section import MAX_ROBOTS, TeamSection
 
 # Bob's map in Ann's: 4 m ahead, turned to the left.
@@ -66,42 +62,3 @@ def test_nothing_is_shown_while_the_own_name_is_unknown_and_strangers_are_bounde
     for number in range(100):
         section.note_placement(placement(f"r{number}", "ann", f"r{number}", Verdict.APART))
     assert len(section.content()) <= MAX_ROBOTS
-
-
-@pytest.mark.skipif(find_browser() is None, reason="the page is looked at in a browser: apt install chromium")
-def test_the_page_draws_the_maps_of_joined_robots_and_lists_all(tmp_path):
-    board = Board()
-    server, browser = PageServer(board, "127.0.0.1", 0), Browser(tmp_path / "profile")
-    try:
-        section = section_of("ann", placement("ann", "ann", "bob"), placement("ann", "ann", "cid", Verdict.APART, 0.2))
-        section.robot_poses["bob"] = [2.0, 1.0, 0.0]
-        cells = np.zeros((30, 50), dtype=np.int8)
-        cells[[0, -1]], cells[:, [0, -1]] = 100, 100
-        tag = board.put_map_image(grid_png(cells), "bob")
-        section.maps["bob"] = {"tag": tag, "origin": [0.0, 0.0], "size": [5.0, 3.0]}
-        board.put("robot", {"pose": [0.0, 0.0, 0.0], "ellipse": None, "deviation": 0.1, "turn": 1.0})
-        board.put("team", section.content())
-        browser.size(1280, 800)
-        browser.open(server.url)
-        drawn = {}
-        deadline = time.monotonic() + 30.0
-        while drawn.get("team") != [{"name": "bob", "map": True, "robot": True}]:
-            assert time.monotonic() < deadline, drawn
-            time.sleep(0.1)
-            drawn = json.loads(browser.evaluate("document.getElementById('plan').dataset.drawn ?? '{}'"))
-        rows = browser.evaluate("document.getElementById('robots').innerText").split("\n")
-        assert [row.strip() for row in rows if row.strip()] == [
-            "bob",
-            "joined, 99.9 %",
-            "cid",
-            "apart, best placement 20.0 %, apart 80.0 %",
-        ]
-        browser.screenshot(tmp_path / "team.png")
-        board.put("team", [])
-        while not browser.evaluate("document.getElementById('team').hidden"):
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
-        assert browser.complaints == []
-    finally:
-        browser.close()
-        server.close()

@@ -81,33 +81,39 @@ class Progress:
         stream: TextIO | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Start the clock.
-
-        :param scans: number of scans of the log.
+        """:param scans: number of scans of the log.
         :param log_seconds: duration of the log, s.
         :param stream: stream to write to, stderr where None.
         :param clock: returns seconds since any start.
         """
         self._scans, self._log_seconds = max(scans, 1), log_seconds
         self._line, self._clock = MovingLine(stream or sys.stderr, clock), clock
-        self._begin = clock()
+        self._first: tuple[int, float] | None = None
 
     def __call__(self, done: int) -> None:
         """Write a line where the period since the last one is over, and at the end."""
-        self._line.show(self.line(done, self._clock() - self._begin), is_last=done >= self._scans)
+        now = self._clock()
+        if self._first is None and done:
+            self._first = done, now
+        self._line.show(self._text(done, now), is_last=done >= self._scans)
 
-    def line(self, done: int, elapsed: float) -> str:
-        """Bar, count, speed and remaining time.
-
-        :param elapsed: time since the start, s.
-        """
+    def _text(self, done: int, now: float) -> str:
+        """Bar, count, speed and remaining time; both from the first scan on, before which kernels may be compiled."""
         share = min(done / self._scans, 1.0)
         filled = int(_BAR * share)
         bar = f"[{'#' * filled}{'.' * (_BAR - filled)}] " if self._line.is_terminal else ""
-        speed = share * self._log_seconds / max(elapsed, 1e-9)
-        left = elapsed * (1.0 - share) / share if share > 0.0 else 0.0
-        rest = f"{_duration(left)} left" if share < 1.0 else "the final map is being made"
-        return f"{bar}{done}/{self._scans} scans, {speed:.1f} x real time, {rest}"
+        return f"{bar}{done}/{self._scans} scans, {self._pace(done, now)}"
+
+    def _pace(self, done: int, now: float) -> str:
+        """Speed relative to real time, and the time that is left."""
+        first, begin = self._first or (done, now)
+        scans, seconds = done - first, max(now - begin, 1e-9)
+        if scans <= 0:
+            return "starting"
+        speed = f"{scans / self._scans * self._log_seconds / seconds:.1f} x real time"
+        if done >= self._scans:
+            return f"{speed}, the final map is being made"
+        return f"{speed}, {_duration((self._scans - done) * seconds / scans)} left"
 
     def __enter__(self) -> Progress:
         """Nothing is prepared."""

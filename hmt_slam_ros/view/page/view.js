@@ -97,7 +97,7 @@ const shown = {
   replay: ({ state: doing, log, done, scans }) => {
     $("replay").hidden = false;
     $("replay").querySelector("progress").value = scans ? Math.min(1, done / scans) : 0;
-    text($("replay").querySelector("span"), `${log}: ${done} of ${scans} scans, ${doing}`);
+    text($("replay").querySelector("span"), `${log}: ${scans ? `${done} of ${scans}` : done} scans, ${doing}`);
   },
   map: ({ tag }) => {
     const next = new Image();
@@ -126,8 +126,10 @@ function tellVerdict(level, sentence, advice) {
 
 function tellLocalized() {
   if (state.localized === undefined) return;
-  const open = state.entropy === undefined ? "" : `, ${state.entropy.toFixed(2)} nats open`;
-  text($("localized"), state.localized ? `yes${state.entropy > 0.005 ? open : ""}` : `no${open}`);
+  // The exponential of the entropy: as open as between so many places of the same probability.
+  const places = Math.exp(state.entropy ?? 0);
+  const open = places < 1.05 ? "" : `, as open as ${places < 10 ? places.toFixed(1) : places.toFixed(0)} places`;
+  text($("localized"), `${state.localized ? "yes" : "no"}${open}`);
 }
 
 function tellHypotheses() {
