@@ -90,6 +90,21 @@ def test_what_is_silent_missing_or_does_not_fit_is_reported(listener, doctor):
     assert len(wrong) == 6, wrong
 
 
+def test_nodes_in_another_namespace_are_not_taken_for_those_of_this_one(listener, doctor):
+    others = [Node("slam", context=listener.context, namespace=namespace) for namespace in ("/robot1", "/robot2")]
+    for other in others:
+        listener.executor.add_node(other)
+    status, findings = doctor(2.0)
+    for other in others:
+        listener.executor.remove_node(other)
+        other.destroy_node()
+    assert status == 1
+    assert (
+        "nodes: None of the nodes of hmt_slam_ros runs in this namespace, but some do in /robot1 and /robot2: hmt_slam "
+        "doctor --live --ros-args -r __ns:=/robot1 examines those, and likewise /robot2."
+    ) in texts(findings, "wrong")
+
+
 def test_nodes_that_are_not_active_are_named_with_what_makes_them_so(listener, start, doctor):
     for name in ("aam", "rtl", "slam", "tlca", "tsbi"):
         start(name, "-r", "__ns:=/robot1", autostart=name == "tsbi")

@@ -78,13 +78,14 @@ class RunningSystem:
 
     :ivar seconds: duration of the observation, s.
     :ivar topics: {name without namespace: topic}.
-    :ivar nodes: names of all nodes but the doctor's.
+    :ivar nodes: names of all nodes in the doctor's namespace, but its own.
     :ivar sim_time_nodes: names of the nodes with use_sim_time.
     :ivar diagnostics: last diagnostics of each node.
     :ivar clock_offsets: {topic: median by which its stamps precede the computer's clock on arrival, s}; empty where
         /clock is published.
     :ivar conflicting_transforms: {transform: number of stamps for which two sources published different values}.
     :ivar missing_laser_transform: sentence about a missing transform of the laser, empty where none is missing.
+    :ivar other_namespaces: other namespaces with nodes of ours.
     """
 
     seconds: float
@@ -95,6 +96,7 @@ class RunningSystem:
     clock_offsets: Mapping[str, float]
     conflicting_transforms: Mapping[str, int]
     missing_laser_transform: str
+    other_namespaces: tuple[str, ...] = ()
 
 
 def running_findings(running: RunningSystem) -> Iterator[Finding]:
@@ -112,7 +114,16 @@ def running_findings(running: RunningSystem) -> Iterator[Finding]:
 def _check_nodes(running: RunningSystem, *, all_active: bool) -> Iterator[Finding]:
     present = [name for name in OUR_NODES if name in running.nodes]
     missing = [name for name in OUR_NODES if name not in present]
-    if not present:
+    if not present and running.other_namespaces:
+        first, *others = running.other_namespaces
+        likewise = f", and likewise {_join_names(others)}" if others else ""
+        text = (
+            "None of the nodes of hmt_slam_ros runs in this namespace, but some do in "
+            f"{_join_names(running.other_namespaces)}: hmt_slam doctor --live --ros-args -r __ns:={first} examines "
+            f"those{likewise}."
+        )
+        yield Finding("wrong", "nodes", text)
+    elif not present:
         text = "None of the nodes of hmt_slam_ros runs, so only the sensors were checked."
         yield Finding("fine", "nodes", text)
     elif missing:

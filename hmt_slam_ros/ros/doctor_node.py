@@ -125,6 +125,14 @@ class DoctorNode(Node):
         """Names of all other nodes."""
         return tuple(name for name in self.get_node_names() if name != self.get_name())
 
+    def _nodes_by_namespace(self) -> dict[str, list[str]]:
+        """{namespace: names of the nodes in it}, without this node."""
+        found: dict[str, list[str]] = defaultdict(list)
+        for name, namespace in self.get_node_names_and_namespaces():
+            if name != self.get_name():
+                found[namespace].append(name)
+        return found
+
     def request_parameters(self) -> None:
         """Request the relevant parameters of every node that has not been requested before."""
         for name, namespace in self.get_node_names_and_namespaces():
@@ -206,15 +214,18 @@ class DoctorNode(Node):
             for full in self._parameter_futures
             if self._parameter_value(full, _USE_SIM_TIME).bool_value
         )
+        nodes = self._nodes_by_namespace()
+        here = tuple(nodes.pop(self.get_namespace(), ()))
         return RunningSystem(
             seconds,
             topics,
-            self.other_nodes,
+            here,
             tuple(with_sim_time),
             tuple(self._node_statuses.values()),
             {} if has_clock else {name: float(np.median(values)) for name, values in self._clock_offsets.items()},
             dict(self._conflicting_transforms),
             self._missing_laser_transform(),
+            tuple(sorted(namespace for namespace, names in nodes.items() if set(names) & set(running.OUR_NODES))),
         )
 
     def _topic(self, name: str, message_count: int | None) -> Topic:
