@@ -1,10 +1,13 @@
 """What a run says while it works, with a clock of its own."""
 
 import io
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from test_results_output_folder import SCANS, STAMPS, make_recorder
 
-from hmt_slam_ros.cli.terminal import Progress
+from hmt_slam_ros.cli.terminal import Progress, summary
 
 
 class Stream(io.StringIO):
@@ -75,3 +78,10 @@ def test_a_log_without_scans_or_time_divides_by_nothing(tty: bool) -> None:
     stream = Stream(tty)
     with Progress(0, 0.0, stream=stream, clock=Clock()) as progress:
         progress(0)
+
+
+def test_the_summary_says_of_how_many_logs_the_scans_are() -> None:
+    recording = make_recorder().finish(STAMPS)
+    assert f" of {SCANS} scans, 0 dropped" in summary(Path("out"), recording, 10.0, 1.0)
+    further = replace(recording, first_scans=(0, SCANS // 2))
+    assert f" of {SCANS} scans of 2 logs, 0 dropped" in summary(Path("out"), further, 10.0, 1.0)

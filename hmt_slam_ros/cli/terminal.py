@@ -188,9 +188,10 @@ def summary(directory: Path, recording: Recording, log_seconds: float, wall_seco
     :param wall_seconds: duration of the run, s.
     """
     arcs = [arc for _, _, arc in recording.hybrid_map.all_arcs()]
-    totals = recording.totals
+    totals, logs = recording.totals, len(recording.first_scans)
+    of_logs = f" of {logs} logs" if logs > 1 else ""
     outcome = (
-        f"{directory}: {totals.processed} of {totals.received} scans, {totals.dropped} dropped; "
+        f"{directory}: {totals.processed} of {totals.received} scans{of_logs}, {totals.dropped} dropped; "
         f"areas: {len(recording.area_poses)}, arcs: {len(arcs)}, "
         f"of them loop closures: {sum(arc.closure for arc in arcs)}; "
         f"{wall_seconds:.1f} s, {log_seconds / max(wall_seconds, 1e-9):.1f} x real time"
