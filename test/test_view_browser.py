@@ -85,10 +85,18 @@ def test_a_log_of_unknown_length_has_no_length(page):
     page.until(lambda: page.text("replay") == "drive: 1594 of 2000 scans, playing")
 
 
-def test_what_is_open_of_the_place_is_said_as_a_number_of_places(page):
+def test_what_is_open_of_the_place_is_shown_as_a_number_of_places(page):
     page.board.put("localized", True)
     page.board.put("entropy", 0.001)
     page.until(lambda: page.text("localized") == "yes")
     page.board.put("localized", False)
     page.board.put("entropy", 0.693)
     page.until(lambda: page.text("localized") == "no, as open as 2.0 places")
+
+
+def test_what_happened_is_listed_with_times(page):
+    incident = {"time": 1_000_000.0, "node": "slam", "level": "attention", "text": "was started again"}
+    page.board.put("incidents", [incident])
+    page.until(lambda: page.text("newest").endswith(", slam"))
+    page.browser.evaluate("document.getElementById('incidents').closest('details').open = true")
+    page.until(lambda: "slam: was started again" in page.text("incidents"))

@@ -49,6 +49,7 @@ from hmt_slam_ros.ros.view_conversions import (
 from hmt_slam_ros.untrusted_input import shorten
 from hmt_slam_ros.view.board import Board, KeyframeHistory
 from hmt_slam_ros.view.health import SystemHealth
+from hmt_slam_ros.view.incidents import IncidentLog
 from hmt_slam_ros.view.server import LOCAL, PORT, PageServer, grid_png
 
 _PERIOD = 0.2
@@ -98,6 +99,7 @@ class ViewNode(GuardedNode):
         self.diagnostics = NodeDiagnostics(self, declare_system(self))
         self.board = Board()
         self._health, self._history = SystemHealth(process_names()), KeyframeHistory(self.board)
+        self._incidents = IncidentLog()
         self._message_times: dict[str, float] = {}
         self._message_count = 0
         # In s; it stands still with the computer, so that no topic seems silent after that.
@@ -194,6 +196,9 @@ class ViewNode(GuardedNode):
         self._health.second_system = self.diagnostics.system.other
         self.board.put("verdict", self._health.verdict(now))
         self.board.put("nodes", self._health.rows(now))
+        for incident in self._incidents.update(self._health.nodes, now, time.time()):
+            self.get_logger().info(f"{incident.node}: {incident.text}")
+        self.board.put("incidents", self._incidents.rows())
         times = self._message_times
         # In whole seconds, so that the page changes once a second.
         ages = {topic: int(now - times[topic]) if topic in times else None for topic in _PUBLISHERS}

@@ -14,7 +14,7 @@ from hmt_slam_ros.messages.system_name import REMEDY
 
 Level = Literal["good", "waiting", "attention", "fault"]
 
-_NODE_TIMEOUT = 10.0
+NODE_TIMEOUT = 10.0
 """Time without diagnostics after which a node is silent, s; each has as long to start. They come once a second."""
 
 _POSE_TIMEOUT = 3.0
@@ -98,7 +98,7 @@ class SystemHealth:
         values = {key[:_MAX_TEXT]: value[:_MAX_TEXT] for key, value in islice(values.items(), _MAX_VALUES)}
         previous, load, changed = self.nodes.get(name), None, now
         if previous is not None and now > previous.heard_at:
-            load = max(0.0, _busy_seconds(values) - _busy_seconds(previous.values)) / (now - previous.heard_at)
+            load = max(0.0, busy_seconds(values) - busy_seconds(previous.values)) / (now - previous.heard_at)
         if previous is not None and previous.message == message:
             changed = previous.changed_at
         self.nodes[name] = NodeHealth(level, message, values, now, changed, load)
@@ -113,7 +113,7 @@ class SystemHealth:
         if node is None:
             return {"name": name, "level": "waiting", "message": "not heard yet", "values": {}}
         age = now - node.heard_at
-        if age > _NODE_TIMEOUT:
+        if age > NODE_TIMEOUT:
             return {"name": name, "level": "fault", "message": f"silent for {age:.0f} s", "values": dict(node.values)}
         level = _level(node, now)
         row = {"name": name, "level": level, "message": node.message, "values": dict(node.values)}
@@ -153,10 +153,10 @@ class SystemHealth:
     def _silent_nodes_verdict(self, now: float) -> dict[str, str] | None:
         never = [name for name in self.expected_nodes if name not in self.nodes]
         if never:
-            level: Level = "fault" if now > _NODE_TIMEOUT else "waiting"
+            level: Level = "fault" if now > NODE_TIMEOUT else "waiting"
             verb = "is" if len(never) == 1 else "are"
             return _verdict(level, f"{_join_names(never)} {verb} not running.", f"ros2 run hmt_slam_ros {never[0]}")
-        silent = [name for name in self.expected_nodes if now - self.nodes[name].heard_at > _NODE_TIMEOUT]
+        silent = [name for name in self.expected_nodes if now - self.nodes[name].heard_at > NODE_TIMEOUT]
         if not silent:
             return None
         age = now - min(self.nodes[name].heard_at for name in silent)
@@ -241,7 +241,7 @@ def _join_names(names: Sequence[str]) -> str:
     return " and ".join((", ".join(names[:-1]), names[-1])) if len(names) > 1 else names[0]
 
 
-def _busy_seconds(values: Mapping[str, str]) -> float:
+def busy_seconds(values: Mapping[str, str]) -> float:
     """Computing time since the start, s."""
     try:
         seconds = float(values.get("busy", "0").removesuffix(" s"))

@@ -116,6 +116,7 @@ const shown = {
   team: tellTeam,
   nodes: tellNodes,
   topics: tellTopics,
+  incidents: tellIncidents,
 };
 
 function tellVerdict(level, sentence, advice) {
@@ -253,6 +254,14 @@ function tellTopics(topics) {
   text($("silent"), silent ? `${silent} silent so far` : "all were heard");
   fillTable($("topics"), topics.map(({ topic, from, age }) =>
     [`${topic}, from ${from}`, age === null ? "silent" : age < 2 ? "now" : `${age} s ago`]));
+}
+
+/** List what happened to the nodes, the newest first. */
+function tellIncidents(incidents) {
+  const rows = incidents.map(({ time, node, text: sentence }) =>
+    [new Date(1000 * time).toLocaleTimeString([], { hour12: false }), `${node}: ${sentence}`]);
+  text($("newest"), rows.length ? `${rows[0][0]}, ${incidents[0].node}` : "nothing");
+  fillTable($("incidents"), rows);
 }
 
 function fillTable(body, rows) {
