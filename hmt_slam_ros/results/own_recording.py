@@ -12,7 +12,6 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap, has_foreign_keyframes
 from hmt_slam_ros.results.recorder import Recording, keyframe_poses
-from hmt_slam_ros.team.own_ground import own_ground
 
 
 def without_foreign_ground(recording: Recording) -> Recording:
@@ -23,6 +22,8 @@ def without_foreign_ground(recording: Recording) -> Recording:
     whole = recording.hybrid_map
     if not any(has_foreign_keyframes(whole.keyframes(area)) for area in whole.area_ids()):
         return recording
+    from hmt_slam_ros.team.own_ground import own_ground  # noqa: PLC0415  networkx takes long to load
+
     hybrid_map = own_ground(whole)
     area_poses = {area: recording.area_poses[area] for area in hybrid_map.area_ids()}
     own = keyframe_poses(hybrid_map, area_poses)
