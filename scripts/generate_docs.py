@@ -160,7 +160,7 @@ _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
     "slam": (*_RESPONSES, "tf_static"),
     "view": (
         *("pose", "hmt/pose", "hmt/graph", "map", "hmt/keyframes", "hmt/hypotheses", "hmt/is_localized"),
-        *("hmt/entropy", "hmt/robot_status", "diagnostics"),
+        *("hmt/entropy", "hmt/robot_status", "diagnostics", "/team/placements"),
     ),
     "robot": ("hmt/local_estimate", "hmt/tracking_reset", "diagnostics"),
     "team": ("hmt/reset_request",),
