@@ -45,10 +45,11 @@ def test_halves_of_a_drive_are_joined_as_in_the_simulation():
     found = meeting((OFFICE, 0), (OFFICE, 1))
     assert found.verdict is Verdict.JOINED
     assert found.distribution.best.probability >= 0.99 and len(found.distribution.best.matches) > 3
-    assert len(map_pieces(found.joined.hybrid_map)) == 1
-    poses, log = keyframe_poses(found.joined), open_log(OFFICE)
+    joined = found.refine(CONFIGURATION)
+    assert len(map_pieces(joined.hybrid_map)) == 1
+    poses, log = keyframe_poses(joined), open_log(OFFICE)
     numbers = sorted(poses)
-    truth = dict(zip(numbers, log.true_poses(np.array([found.joined.scans[k].stamp for k in numbers])), strict=True))
+    truth = dict(zip(numbers, log.true_poses(np.array([joined.scans[k].stamp for k in numbers])), strict=True))
     first = found.pair.first_keyframe
     known = np.array([truth[k][:2] for k in numbers if k < first])
     for k in numbers[first:]:
@@ -146,6 +147,23 @@ def test_arcs_that_contradict_one_another_join_nothing(shift, verdict):
     pair, windows, placement = matched_at(shift)
     found, joined = decide(pair, windows, PlacementDistribution((placement,), 0.001), CONFIGURATION)
     assert found is verdict and (joined is not None) == (verdict is Verdict.JOINED)
+
+
+@pytest.mark.parametrize(("distance", "verdict"), [(0.0, Verdict.CONTRADICTORY), (12.0, Verdict.JOINED)])
+def test_windows_are_off_by_what_areas_bend_inside(distance, verdict):
+    """Two windows differ by 0.4 m: five deviations of the arcs, and two far from the origins of the areas."""
+    pair, windows, placement = matched_at(0.4)
+    arc = PoseGaussian(np.array([3.0, 0.0, 0.0]), np.diag([0.05, 0.05, 0.005]) ** 2)
+    for areas in (pair.known, pair.other):
+        pair.hybrid_map.set_arc(*areas, arc, closure=False)
+    there = np.array([distance, 0.0, 0.0])
+    windows = [Window(window.area, there, window.poses) for window in windows]
+    matches = {
+        n: match._replace(belief=PoseGaussian(match.belief.mean + there, TIGHT))
+        for n, match in placement.matches.items()
+    }
+    distribution = PlacementDistribution((replace(placement, matches=matches),), 0.001)
+    assert decide(pair, windows, distribution, CONFIGURATION)[0] is verdict
 
 
 @pytest.mark.parametrize(

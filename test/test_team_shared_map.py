@@ -111,6 +111,32 @@ def test_the_robots_own_area_is_shared_in_steps():
     assert_same(foreign, robot, [0])
 
 
+def test_what_is_not_committed_yet_is_shared_in_steps():
+    """Keyframes become definite with the next accepted hypothesis, which may take a whole area."""
+    robot, foreign = Robot(), ForeignMap(ForeignMapState("a"))
+    replica = Replica(robot.scans, {0: robot.map}, {0: 1.0}, {0: 0})
+    for n in range(2 * NEW_KEYFRAMES):
+        robot.map.set_keyframe(n, 0, np.array([0.3 * n, 0.0, 0.0]))
+        robot.scans[n] = worlds.scan_in(ROOM, (0.1 * n, 0.0, 0.0), stamp=n)
+        assert robot.shared.take_over(replica) == (n in (NEW_KEYFRAMES - 1, 2 * NEW_KEYFRAMES - 1))
+    receive(foreign, robot)
+    assert_same(foreign, robot, [0])
+
+
+def test_what_hypotheses_have_in_different_ways_stays_as_it_was_shared():
+    robot, foreign = Robot(), ForeignMap(ForeignMapState("a"))
+    robot.map_keyframes(0, NEW_KEYFRAMES)
+    for n in range(NEW_KEYFRAMES, 2 * NEW_KEYFRAMES):
+        robot.map.set_keyframe(n, 0, np.array([0.3 * n, 0.0, 0.0]))
+        robot.scans[n] = worlds.scan_in(ROOM, (0.1 * n, 0.0, 0.0), stamp=n)
+    assert robot.shared.take_over(Replica(robot.scans, {0: robot.map}, {0: 1.0}, {0: 0}))
+    maps = {0: robot.map, 1: robot.map.branch()}
+    maps[1].remove_keyframe(1, 0)
+    assert not robot.shared.take_over(Replica(robot.scans, maps, {0: 0.5, 1: 0.5}, {0: 1, 1: 1}))
+    receive(foreign, robot)
+    assert_same(foreign, robot, [0])
+
+
 def test_a_large_map_comes_in_parts(monkeypatch):
     monkeypatch.setattr(shared_map, "UPDATE_BYTES", 5_000)
     robot, foreign = with_three_areas(), ForeignMap(ForeignMapState("a"))

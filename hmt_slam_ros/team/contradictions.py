@@ -14,7 +14,6 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.surroundings import (
     AreaPlace,
     GridCache,
-    Neighborhood,
     containing_area,
     keyframe_positions,
     min_distance,
@@ -22,7 +21,7 @@ from hmt_slam_ros.hybrid_map.surroundings import (
 )
 from hmt_slam_ros.registration.area_to_area import MatchSettings, best_pose
 from hmt_slam_ros.registration.consistency import MAP_IN_MAP
-from hmt_slam_ros.registration.likelihood_grid import AreaGrid, GridModel
+from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 from hmt_slam_ros.team.components import ComponentPair
 from hmt_slam_ros.team.placement import PlacementGeometry
 from hmt_slam_ros.team.windows import Window
@@ -44,11 +43,12 @@ class PlaceComparison:
         windows: Sequence[Window],
         geometry: PlacementGeometry,
         configuration: Configuration,
+        grid_cache: GridCache,
     ) -> None:
+        """:param grid_cache: of the scans of both components."""
         options = configuration.tsbi
         self._pair, self._windows, self._geometry = pair, windows, geometry
-        neighborhood = Neighborhood(options.local_sigma, options.local_reach)
-        self._grid_cache = GridCache(pair.scans, GridModel.from_configuration(configuration), neighborhood)
+        self._grid_cache = grid_cache
         self._settings = replace(MatchSettings.from_options(options), min_log_ratio=MIN_LOG_RATIO)
         self._radius = options.place_radius
         self._outlier_rate = pair.clutter.beam_outlier_rate

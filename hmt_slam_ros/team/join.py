@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.topology import LoopClosureParameters
 from hmt_slam_ros.configuration.tree import Configuration
-from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_quantile
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap, apply_sigma_floor, fuse_traversals
+from hmt_slam_ros.hybrid_map.hybrid_map import AreaPair, HybridMap, apply_sigma_floor, fuse_traversals
 from hmt_slam_ros.hybrid_map.pose_graph import total_arc_chi2
+from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.loop_closure.closure_refinement import ClosureRefinement
 from hmt_slam_ros.messages.team import Verdict
 from hmt_slam_ros.team.components import Component, ComponentPair, combine
@@ -36,14 +37,19 @@ class Meeting:
     :ivar distribution: PMF over placements.
     :ivar verdict: joined; apart, as the placements together are less probable than that; open, as none is sure;
         or contradictory, as the arcs of a sure placement contradict one another.
-    :ivar joined: the two as one component, None unless they were joined.
+    :ivar joined: the two with the arcs of the join, None unless they were joined.
     """
 
     pair: ComponentPair
     windows: tuple[Window, ...]
     distribution: PlacementDistribution
     verdict: Verdict
-    joined: Component | None = None
+    joined: HybridMap | None = None
+
+    def refine(self, configuration: Configuration) -> Component:
+        """The two that were joined as one component, with the keyframes of the joined areas registered."""
+        assert self.joined is not None
+        return self.pair.as_one(_refine(self.pair, self.joined, configuration))
 
 
 def meet(first: Component, second: Component, configuration: Configuration) -> Meeting:
@@ -64,8 +70,8 @@ def judge(search: PlacementSearch, configuration: Configuration) -> Meeting:
 
 def decide(
     pair: ComponentPair, windows: Sequence[Window], distribution: PlacementDistribution, configuration: Configuration
-) -> tuple[Verdict, Component | None]:
-    """What becomes of two components, and both as one where they are joined."""
+) -> tuple[Verdict, HybridMap | None]:
+    """What becomes of two components, and both with the arcs of the join where they are joined."""
     best, options = distribution.best, configuration.tlca
     if best is None or distribution.apart >= 0.5:
         return Verdict.APART, None
@@ -74,7 +80,7 @@ def decide(
     joined = join_at(pair, windows, best, options)
     if _is_contradictory(pair, joined, options):
         return Verdict.CONTRADICTORY, None
-    return Verdict.JOINED, pair.as_one(_refine(pair, joined, configuration))
+    return Verdict.JOINED, joined
 
 
 def join_at(
@@ -84,10 +90,12 @@ def join_at(
     joined = pair.hybrid_map.subgraph(pair.hybrid_map.area_ids())
     joined.remove_arc(*pair.joint)
     joined.commit()
+    drift = _drift_per_meter(pair)
     for number, match in placement.matches.items():
         window = windows[number]
-        to_area = PoseGaussian.from_pose(se2.inverse(window.reference))
-        belief = _with_floor(match.belief.compose(to_area), options)
+        in_known = PoseGaussian(match.belief.mean, match.belief.covariance + _drift_at(match.belief.mean, drift))
+        in_area = PoseGaussian(window.reference, _drift_at(window.reference, drift))
+        belief = _with_floor(in_known.compose(in_area.inverse()), options)
         known = joined.arc(match.area, window.area)
         arc = belief if known is None else fuse_traversals(known, belief, shared=0.0)
         joined.set_arc(match.area, window.area, arc, closure=True)
@@ -95,18 +103,40 @@ def join_at(
     return joined
 
 
+def _drift_per_meter(pair: ComponentPair) -> Float64:
+    """Covariance of the pose of a keyframe in its area, per meter from the origin, shape (3, 3).
+
+    Areas bend inside as paths do from one to the next: it is that of the arcs of both components, on average. Without
+    arcs it is zero, as nothing can contradict then.
+    """
+    inside = [arc.pose for a, b, arc in pair.hybrid_map.all_arcs() if (a in pair.known) == (b in pair.known)]
+    length = sum(float(np.hypot(*arc.mean[:2])) for arc in inside if not is_uninformative(arc))
+    total = sum((arc.covariance for arc in inside if not is_uninformative(arc)), np.zeros((3, 3)))
+    return total / length if length > 0.0 else np.zeros((3, 3))
+
+
+def _drift_at(pose: Float64, per_meter: Float64) -> Float64:
+    """Covariance of a pose in its area, shape (3, 3), by its distance from the origin."""
+    return float(np.hypot(*pose[:2])) * per_meter
+
+
 def _is_contradictory(pair: ComponentPair, joined: HybridMap, options: LoopClosureParameters) -> bool:
     """Whether the arcs of a join contradict one another, by the chi-square of the cycles that they close."""
-    arcs = sum(a in pair.known and b in pair.other for a, b, _ in joined.all_arcs())
+    arcs = len(_joining_pairs(pair, joined))
     before = sum(total_arc_chi2(joined.subgraph(areas)) for areas in (pair.known, pair.other))
     freedom = _POSE_DOF * (arcs - 1)
     gate = chi_square_quantile(options.contradiction_probability, freedom) if freedom else 0.0
     return freedom > 0 and total_arc_chi2(joined) - before > gate
 
 
+def _joining_pairs(pair: ComponentPair, joined: HybridMap) -> list[AreaPair]:
+    """The areas that arcs join, as (of the first component, of the second)."""
+    return [(a, b) for a, b, _ in joined.all_arcs() if a in pair.known and b in pair.other]
+
+
 def _refine(pair: ComponentPair, joined: HybridMap, configuration: Configuration) -> HybridMap:
     """The map with the keyframes of the areas that were joined registered with one another."""
-    closed = sorted({area for a, b, _ in joined.all_arcs() if a in pair.known and b in pair.other for area in (a, b)})
+    closed = sorted({area for ends in _joining_pairs(pair, joined) for area in ends})
     found = ClosureRefinement(configuration).refine(joined, pair.scans, closed)
     for area, keyframes in found.keyframes.items():
         joined.changed_areas[area] = dict(keyframes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.messages.map_changes import Pose
 from hmt_slam_ros.messages.team import JoiningArc, Verdict
 from hmt_slam_ros.team.join import Meeting
@@ -33,22 +34,26 @@ class JoinState:
     """How far the join with another robot's map is.
 
     :ivar sure: the placement that is sure, None where none is.
-    :ivar joining_arcs: of the join, none without.
+    :ivar is_joined: whether the two maps are joined.
+    :ivar joining_arcs: of the join, with ``team.uses_ground``; none without.
     :ivar sent_version: of the other map, up to which its ground was sent to TLCA.
     """
 
     sure: SurePlacement | None = None
+    is_joined: bool = False
     joining_arcs: tuple[JoiningArc, ...] = ()
     sent_version: int = 0
 
 
-def next_join(join: JoinState, meeting: Meeting, keyframes: int, *, is_first: bool) -> JoinState:
+def next_join(
+    join: JoinState, meeting: Meeting, keyframes: int, configuration: Configuration, *, is_first: bool
+) -> JoinState:
     """How far a join is after a comparison.
 
     :param keyframes: number of keyframes of both maps.
     :param is_first: whether the first component is the robot's own.
     """
-    if join.joining_arcs and not _may_hold(meeting):
+    if join.is_joined and not _may_hold(meeting):
         return JoinState()
     if meeting.verdict is not Verdict.JOINED:
         return replace(join, sure=None)
@@ -57,25 +62,37 @@ def next_join(join: JoinState, meeting: Meeting, keyframes: int, *, is_first: bo
     sure = join.sure
     if sure is None or not is_same_placement(sure.pose, best.pose):
         sure = SurePlacement(keyframes, best.pose)
-    if not join.joining_arcs and keyframes - sure.keyframes < _CONFIRMING_KEYFRAMES:
+    if not join.is_joined and keyframes - sure.keyframes < _CONFIRMING_KEYFRAMES:
         return replace(join, sure=sure)
-    return replace(join, sure=sure, joining_arcs=_joining_arcs(meeting, is_first=is_first))
+    # Registration takes longer than the comparison, and only those who use the ground need the arcs.
+    arcs = _joining_arcs(join, meeting, configuration, is_first=is_first) if configuration.team.uses_ground else ()
+    return replace(join, sure=sure, is_joined=True, joining_arcs=arcs)
 
 
-def _joining_arcs(meeting: Meeting, *, is_first: bool) -> tuple[JoiningArc, ...]:
+def _joining_arcs(
+    join: JoinState, meeting: Meeting, configuration: Configuration, *, is_first: bool
+) -> tuple[JoiningArc, ...]:
     """The arcs of a join, from the robot's own areas.
+
+    Those of earlier comparisons stay while their areas are there: a robot prunes what it mapped in the ground of
+    another one, and with that the windows by which it was joined.
 
     :param is_first: whether the first component is the robot's own.
     """
-    pair, joined = meeting.pair, meeting.joined
-    assert joined is not None
-    arcs = []
-    for known, other, arc in joined.hybrid_map.all_arcs():
+    pair = meeting.pair
+    known_areas, other_areas = set(pair.known), {area - pair.area_shift for area in pair.other}
+    own_areas, foreign_areas = (known_areas, other_areas) if is_first else (other_areas, known_areas)
+    arcs = {
+        (arc.own_area, arc.foreign_area): arc
+        for arc in join.joining_arcs
+        if arc.own_area in own_areas and arc.foreign_area in foreign_areas
+    }
+    for known, other, arc in meeting.refine(configuration).hybrid_map.all_arcs():
         if known in pair.known and other in pair.other:
             number = other - pair.area_shift
             own = JoiningArc(known, number, arc.pose) if is_first else JoiningArc(number, known, arc.pose.inverse())
-            arcs.append(own)
-    return tuple(arcs)
+            arcs[own.own_area, own.foreign_area] = own
+    return tuple(arcs.values())
 
 
 def _may_hold(meeting: Meeting) -> bool:

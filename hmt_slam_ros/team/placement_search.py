@@ -117,5 +117,5 @@ class PlacementSearch:
             for n, own in enumerate(self._searches.values())
         ]
         geometry = PlacementGeometry(pair.hybrid_map, self._windows)
-        comparison = PlaceComparison(pair, self._windows, geometry, self._configuration)
+        comparison = PlaceComparison(pair, self._windows, geometry, self._configuration, self._map_search.grid_cache)
         return placement_distribution(geometry, candidates, pair.joint, known, comparison.log_ratio)

@@ -10,15 +10,16 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import reduce
+from itertools import chain
 from operator import attrgetter, xor
 from typing import NamedTuple
 
 import numpy as np
 
-from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, CommonMap, HybridMap, KeyframePoses, has_foreign_keyframes
+from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, HybridMap, KeyframePoses, has_foreign_keyframes
 from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
 from hmt_slam_ros.messages.map_changes import Arc
 from hmt_slam_ros.messages.replica import Replica
@@ -42,9 +43,13 @@ _DIGEST_BYTES = 8
 
 
 class _Content(NamedTuple):
-    """An area as it was shared: the very objects, which are replaced by every change."""
+    """An area as it was shared: the very objects, which are replaced by every change.
+
+    :ivar keyframes: the mapping itself where the map is definite, a copy where the map changes it in place.
+    """
 
     keyframes: KeyframePoses
+    scans: Mapping[int, Scan]
     arcs: tuple[ArcValue, ...]
 
 
@@ -104,35 +109,34 @@ class SharedMap:
     def take_over(self, replica: Replica) -> bool:
         """Share what is definite in the maps of all hypotheses, and the robot's own; whether something is new."""
         before = self.version
-        common = next(iter(replica.maps.values())).common
-        if any(has_foreign_keyframes(keyframes) for keyframes in common.areas.values()):
-            common = own_ground(HybridMap(common)).common
-        arcs = _arcs_by_larger_area(common)
+        hybrid_map, undecided = _agreed_map(replica)
+        areas = hybrid_map.area_ids()
+        if any(has_foreign_keyframes(hybrid_map.keyframes(area)) for area in areas):
+            hybrid_map = own_ground(hybrid_map)
+            areas = hybrid_map.area_ids()
+        arcs_of = _arcs_by_larger_area(hybrid_map)
         occupied = set(replica.robot_areas.values())
         for item in self._areas():
-            if item.area not in common.areas:
+            if item.area not in undecided and not hybrid_map.has_area(item.area):
                 self._contents.pop(item.area, None)
                 self._add_area(item.area, {}, {})
-        for area, keyframes in common.areas.items():
-            content = _Content(keyframes, tuple(arcs.get(area, {}).values()))
-            if not self._is_due(area, content, area in occupied):
+        for area in areas:
+            keyframes, arcs = hybrid_map.keyframes(area), arcs_of.get(area, {})
+            known = self._contents.get(area)
+            if area in undecided or (known is not None and _is_as_before(known, keyframes, arcs)):
+                continue
+            # Keyframes that were pruned leave the definite map with the next decision.
+            scans = {keyframe: replica.scans[keyframe] for keyframe in keyframes if keyframe in replica.scans}
+            is_definite = area not in hybrid_map.changed_areas
+            content = _Content(keyframes if is_definite else dict(keyframes), scans, tuple(arcs.values()))
+            if not _is_due(known, content, area in occupied):
                 continue
             self._contents[area] = content
-            # Keyframes that were pruned leave the definite map with the next decision.
-            kept = {keyframe: pose for keyframe, pose in keyframes.items() if keyframe in replica.scans}
-            for keyframe in kept:
-                self._add_scan(keyframe, replica.scans[keyframe])
-            self._add_area(area, kept, arcs.get(area, {}))
+            for keyframe, scan in scans.items():
+                self._add_scan(keyframe, scan)
+            self._add_area(area, {keyframe: keyframes[keyframe] for keyframe in scans}, arcs)
         self._forget_scans()
         return self.version > before
-
-    def _is_due(self, area: int, content: _Content, is_occupied: bool) -> bool:
-        """Whether an area is to be shared: it changed, and the robot has left it or mapped more of it."""
-        known = self._contents.get(area)
-        if not content.keyframes or (known is not None and _is_same(known, content)):
-            return False
-        count = 0 if known is None else len(known.keyframes)
-        return not is_occupied or len(content.keyframes) >= count + NEW_KEYFRAMES
 
     def _add_scan(self, keyframe: int, scan: Scan) -> None:
         known = self._items.get(("scan", keyframe))
@@ -179,18 +183,45 @@ class SharedMap:
         return TeamUpdate(self.robot, self.session, version, last, scans, areas, is_complete, self.clutter)
 
 
-def _arcs_by_larger_area(common: CommonMap) -> dict[int, dict[int, ArcValue]]:
+def _agreed_map(replica: Replica) -> tuple[HybridMap, set[int]]:
+    """A map of what the hypotheses agree on, and the areas that are not the same in all of them."""
+    first, *others = replica.maps.values()
+    if not others:
+        return first, set()
+    changed = [{*each.changed_areas, *chain.from_iterable(each.changed_arcs)} for each in replica.maps.values()]
+    return HybridMap(first.common), set().union(*changed)
+
+
+def _arcs_by_larger_area(hybrid_map: HybridMap) -> dict[int, dict[int, ArcValue]]:
     """{larger area: {smaller area: arc}}."""
     arcs: dict[int, dict[int, ArcValue]] = {}
-    for (a, b), arc in common.arcs.items():
+    for a, b, arc in hybrid_map.all_arcs():
         arcs.setdefault(b, {})[a] = arc
     return arcs
 
 
-def _is_same(one: _Content, other: _Content) -> bool:
-    if one.keyframes is not other.keyframes or len(one.arcs) != len(other.arcs):
-        return False
-    return all(a is b for a, b in zip(one.arcs, other.arcs, strict=True))
+def _is_as_before(known: _Content, keyframes: KeyframePoses, arcs: Mapping[int, ArcValue]) -> bool:
+    """Whether an area has the very mapping of keyframes, and the very arcs, as when it was shared."""
+    return known.keyframes is keyframes and _are_same(known.arcs, arcs.values())
+
+
+def _is_due(known: _Content | None, content: _Content, is_occupied: bool) -> bool:
+    """Whether an area is to be shared: it changed, and the robot has left it or mapped more of it."""
+    if known is None:
+        return len(content.keyframes) >= (NEW_KEYFRAMES if is_occupied else 1)
+    if is_occupied:
+        return len(content.keyframes) >= len(known.keyframes) + NEW_KEYFRAMES
+    return not (
+        content.keyframes.keys() == known.keyframes.keys()
+        and _are_same(content.keyframes.values(), known.keyframes.values())
+        and _are_same(content.scans.values(), known.scans.values())
+        and _are_same(content.arcs, known.arcs)
+    )
+
+
+def _are_same(some: Collection[object], others: Collection[object]) -> bool:
+    """Whether both have the very same objects, in the same order."""
+    return len(some) == len(others) and all(one is other for one, other in zip(some, others, strict=True))
 
 
 def _size(item: SharedItem) -> int:

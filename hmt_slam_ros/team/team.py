@@ -33,7 +33,7 @@ MAX_ROBOTS = 16
 _SHIFT = Shift(MAX_TEAM_AREAS, MAX_TEAM_KEYFRAMES)
 """Added to the numbers of the second component of a pair, beyond those of any robot's map."""
 
-_MIN_GROWTH = 8
+_MIN_GROWTH = 16
 """New keyframes of both robots after which their maps are compared again, unless the robots stand."""
 
 _STEPS = 8
@@ -266,7 +266,8 @@ class Team:
         """
         answers: list[Message] = []
         for name, pair in sorted(self._pairs.items()):
-            if pair.is_outdated:
+            # A search ends with the maps with which it began: maps that grow would put its end off again and again.
+            if pair.is_outdated and pair.is_judged:
                 self._update(name, pair, _MIN_GROWTH if may_wait else 0)
             while steps > 0 and not pair.is_judged:
                 steps -= 1
@@ -298,11 +299,11 @@ class Team:
         pair.is_judged = True
         first, second = sorted((self._robot, name))
         before = pair.join
-        pair.join = next_join(before, meeting, pair.keyframes, is_first=self._robot == first)
+        pair.join = next_join(before, meeting, pair.keyframes, self._configuration, is_first=self._robot == first)
         ground = self._joined_ground(name, pair, before)
         now = _placement(self._robot, first, second, meeting)
         if meeting.verdict in (Verdict.JOINED, Verdict.OPEN):
-            now = replace(now, verdict=Verdict.JOINED if pair.join.joining_arcs else Verdict.OPEN)
+            now = replace(now, verdict=Verdict.JOINED if pair.join.is_joined else Verdict.OPEN)
         earlier = self._placements.get((self._robot, first, second))
         if earlier is not None and _is_same(now, earlier):
             return ground
@@ -314,8 +315,8 @@ class Team:
         other, join = self._others[name].map, pair.join
         if not self._configuration.team.uses_ground:
             return []
-        if not join.joining_arcs:
-            return [JoinedGround(name, other.session, (), (), ())] if before.joining_arcs else []
+        if not join.is_joined:
+            return [JoinedGround(name, other.session, (), (), ())] if before.is_joined else []
         scans, areas = other.items_after(join.sent_version)
         if not areas:
             return []

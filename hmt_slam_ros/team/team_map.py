@@ -89,7 +89,7 @@ def merge_components(components: Mapping[str, Component], configuration: Configu
                 apart.append(piece)
                 continue
             shifts = dict(piece.shifts) | _add_shifts(newest, found.pair.area_shift, found.pair.first_keyframe)
-            newest = Piece(found.joined, shifts)
+            newest = Piece(found.refine(configuration), shifts)
         pieces = [*apart, newest]
     order = list(components)
     pieces.sort(key=lambda piece: min(order.index(name) for name in piece.shifts))

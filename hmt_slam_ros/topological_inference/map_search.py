@@ -35,6 +35,7 @@ class MapSearch:
     """Searches the whole of a hybrid map for keyframes.
 
     :ivar work: of the event, which it shares with the comparison of areas.
+    :ivar grid_cache: grids of the whole map.
     """
 
     def __init__(self, configuration: Configuration, scans: Mapping[int, Scan], work: EventWork) -> None:
@@ -44,9 +45,9 @@ class MapSearch:
         self._descriptors = ScanDescriptors(scans)
         radius = Neighborhood(options.local_sigma, options.local_reach)
         model = GridModel.from_configuration(configuration)
-        self._grid_cache = GridCache(scans, model, radius, count_cells=self._count_cells)
+        self.grid_cache = GridCache(scans, model, radius, count_cells=self._count_cells)
         self._matcher = GlobalScanMatcher(
-            self._grid_cache,
+            self.grid_cache,
             FreeSpaceCheck(scans, configuration),
             MatchSettings.from_options(options),
             options.place_radius,
@@ -56,18 +57,18 @@ class MapSearch:
     @property
     def state(self) -> GridCacheState:
         """The maps that it holds."""
-        return self._grid_cache.state
+        return self.grid_cache.state
 
     def restore(self, state: GridCacheState) -> None:
         """Start from a saved state."""
-        self._grid_cache.restore(state)
+        self.grid_cache.restore(state)
 
     def _count_cells(self, cells: int) -> None:
         self.work.add(CELL_WORK * cells)
 
     def forget_scans(self) -> None:
         """Drop what was computed from scans, of which some have changed."""
-        self._grid_cache.clear()
+        self.grid_cache.clear()
         self._descriptors.clear()
 
     def begin(
@@ -152,4 +153,4 @@ class MapSearch:
 
     def end(self) -> None:
         """Free the grids of the whole map, which take as much memory as a large building's submaps."""
-        self._grid_cache.clear()
+        self.grid_cache.clear()
