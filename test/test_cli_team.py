@@ -35,6 +35,14 @@ def test_robots_of_one_building_have_one_map_and_each_its_own(tmp_path, capsys):
         }
         assert main(["plot", str(out / robot)]) == 0
     assert {"hmt_map", "map.png", "topology.graphml"} <= {each.name for each in out.iterdir()}
+    # The team goes on, to the ends of the logs; ground that the robots have is not taken again.
+    assert run_map(FIRST, SECOND, "--team", "--from", out, "--duration", "0", "--out", tmp_path / "further") == 0
+    assert "joined" in capsys.readouterr().err
+    for robot in ROBOTS:
+        before, after = (read_saved_map(each / robot / "hmt_map").replica.scans for each in (out, tmp_path / "further"))
+        assert len(after) > len(before)
+        stamps = [scan.stamp for keyframe, scan in after.items() if has_foreign_keyframes([keyframe])]
+        assert len(stamps) == len(set(stamps))
     # An old result is replaced.
     assert run_map(FIRST, SECOND, "--team", "--duration", "10", "--out", out) == 0
 
@@ -64,7 +72,8 @@ def test_a_replay_of_several_logs_is_of_a_team(tmp_path, capsys):
     [
         ((FIRST, "--team"), "--team maps several logs at once, and one is given: name another one"),
         ((FIRST, SECOND), "map takes one log, and 2 are given: give one, or --team"),
-        ((FIRST, SECOND, "--team", "--mode", "lifelong"), "--team maps from scratch: leave out --from and --mode"),
+        ((FIRST, SECOND, "--team", "--mode", "lifelong"), "--team maps: leave out --mode"),
+        ((FIRST, SECOND, "--team", "--from", "nowhere"), "nowhere has no results of a team, and 2 logs are given"),
         ((FIRST, FIRST, "--team", "--duration", "20"), "all scans of robot_2 are in robot_1, too: leave it out"),
     ],
 )

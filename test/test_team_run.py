@@ -103,7 +103,7 @@ def _progress(result):
 
 def test_three_robots_join_in_pairs():
     placements = []
-    logs = halves(OFFICE, ("ann", "bob"), 0.7) | {"cid": halves(OFFICE, ("cid", "-"), 0.7)["cid"]}
+    logs = halves(OFFICE, ("ann", "bob"), 0.6) | {"cid": halves(OFFICE, ("cid", "-"), 0.6)["cid"]}
     run = TeamRun(CONFIGURATION, logs, lambda _, each: placements.append(each))
     run.run()
     for name, team in run.teams.items():

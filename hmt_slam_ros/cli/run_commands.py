@@ -43,7 +43,7 @@ from hmt_slam_ros.saved_map.folder import HMT_MAP
 def run_map(options: argparse.Namespace) -> None:
     """Map the log, write the output folder and print a summary."""
     check_single_log(options)
-    configuration, state, log = _initial_state(options)
+    configuration, state, log = initial_state(options, options.log, options.source)
     report_left_out(log, options.command)
     check_output(options.out, options.command)
     log_seconds = log.duration
@@ -69,23 +69,28 @@ def check_output(directory: Path, command: str) -> None:
         print(f"hmt_slam {command}: {sentence}", file=sys.stderr)
 
 
-def _initial_state(options: argparse.Namespace) -> tuple[Configuration, RunState, Log]:
-    """Configuration, initial state and log of a run, which continues the map of ``--from`` where that is given."""
-    if options.source is None:
+def initial_state(options: argparse.Namespace, path: Path, source: Path | None) -> tuple[Configuration, RunState, Log]:
+    """Configuration, initial state and log of a run.
+
+    :param path: of the log.
+    :param source: output folder or map that the run continues, None for none.
+    :raises HmtSlamError: where the map is damaged, or the log cannot be read.
+    """
+    if source is None:
         configuration = chosen_configuration(options)
         if configuration.mode == "localization":
             raise HmtSlamError("mode = localization wants a map to find the robot in: give --from, or map first")
-        return configuration, RunState(), open_time_window(options.log, configuration)
-    folder = map_folder(options.source)
+        return configuration, RunState(), open_time_window(path, configuration)
+    folder = map_folder(source)
     state, saved = read_run_state(folder)
     whole = with_changes(saved, {"robot.duration": 0.0})
     configuration = chosen_configuration(options, whole)
-    log = open_time_window(options.log, configuration)
+    log = open_time_window(path, configuration)
     further = not is_newest_log(state.log, log)
     if further:
         state = replace(state, log=replace(state.log, earlier_trajectory=read_saved_map(folder).relative_trajectory))
         configuration = chosen_configuration(options, with_changes(whole, {"robot.start": 0.0}))
-        log = open_time_window(options.log, configuration)
+        log = open_time_window(path, configuration)
     changes = describe_parameter_changes(saved, configuration, further=further)
     for sentence in filter(None, (describe_log(state.log, log.name, further=further), changes)):
         print(f"hmt_slam map: {sentence}", file=sys.stderr)

@@ -9,12 +9,21 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hmt_slam_ros.cli.arguments import chosen_configuration
-from hmt_slam_ros.cli.run_commands import announce_page, check_output, finish_measured, load_replay, open_time_window
+from hmt_slam_ros.cli.run_commands import (
+    announce_page,
+    check_output,
+    finish_measured,
+    initial_state,
+    load_replay,
+    open_time_window,
+)
 from hmt_slam_ros.cli.terminal import Progress, report_left_out, summary
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs.records import Log
 from hmt_slam_ros.messages.team import TeamPlacement
 from hmt_slam_ros.offline.team_run import TeamRun
+from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.results.merged_map import describe_meeting, read_team, write_merged
 from hmt_slam_ros.results.output_folder import atomic_output, map_writer, robot_folder, write_output
 from hmt_slam_ros.team.team_map import merge_components
@@ -22,10 +31,11 @@ from hmt_slam_ros.team.team_map import merge_components
 
 def run_team(options: argparse.Namespace) -> None:
     """Map the logs at once; write the map of the team, and a folder for each robot in it."""
-    configuration, paths = _checked_configuration(options), [options.log, *options.others]
-    logs = {robot_folder(n): open_time_window(path, configuration) for n, path in enumerate(paths, 1)}
-    for log in logs.values():
-        report_left_out(log, options.command)
+    configuration = _checked_configuration(options)
+    states, logs = dict[str, RunState](), dict[str, Log]()
+    for name, (path, source) in _sources(options).items():
+        configuration, states[name], logs[name] = initial_state(options, path, source)
+        report_left_out(logs[name], options.command)
     wall, cpu = time.monotonic(), time.process_time()
     check_output(options.out, options.command)
     with atomic_output(options.out) as folder:
@@ -33,12 +43,31 @@ def run_team(options: argparse.Namespace) -> None:
         for name in logs:
             (folder / name).mkdir()
             writers[name] = map_writer(folder / name)
-        results = TeamRun(configuration, logs, _report_at).run(lambda name, state: writers[name].write_state(state))
+        run = TeamRun(configuration, logs, _report_at, states=states)
+        results = run.run(lambda name, state: writers[name].write_state(state))
         for name, log in logs.items():
             final, stamps, figures = finish_measured(log, results[name], configuration, wall, cpu)
             write_output(folder / name, final, stamps, figures, configuration, writers[name])
             print(summary(options.out / name, final.recording, log.duration, figures.wall_seconds))
         _write_team(folder, list(logs), configuration)
+
+
+def _sources(options: argparse.Namespace) -> dict[str, tuple[Path, Path | None]]:
+    """{robot: its log, and its folder in the results that the run continues, None without}.
+
+    :raises HmtSlamError: unless these are the results of as many robots.
+    """
+    robots = {robot_folder(n): path for n, path in enumerate([options.log, *options.others], 1)}
+    if options.source is None:
+        return {name: (path, None) for name, path in robots.items()}
+    there = [each.name for each in options.source.glob(f"{robot_folder(0)[:-1]}*")] if options.source.is_dir() else []
+    if sorted(there) != sorted(robots):
+        found = f"the results of {len(there)} robots" if there else "no results of a team"
+        raise HmtSlamError(
+            f"{options.source} has {found}, and {len(robots)} logs are given: with --team, --from is the output folder "
+            "of map --team for as many robots"
+        )
+    return {name: (path, options.source / name) for name, path in robots.items()}
 
 
 def run_team_replay(options: argparse.Namespace) -> None:
@@ -76,8 +105,8 @@ def _checked_configuration(options: argparse.Namespace) -> Configuration:
     """
     if not options.others:
         raise HmtSlamError("--team maps several logs at once, and one is given: name another one")
-    if getattr(options, "source", None) is not None or getattr(options, "mode", None) is not None:
-        raise HmtSlamError("--team maps from scratch: leave out --from and --mode")
+    if getattr(options, "mode", None) is not None:
+        raise HmtSlamError("--team maps: leave out --mode")
     return chosen_configuration(options)
 
 

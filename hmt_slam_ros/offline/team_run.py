@@ -16,6 +16,9 @@ from hmt_slam_ros.process_table import TEAM
 from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.team.team import Team, TeamState
 
+_SESSION = "lock-step"
+"""Of all maps: a run that goes on has the map of the one before."""
+
 
 class _Radio:
     """The process team of a robot, whose messages wait for the others."""
@@ -42,15 +45,24 @@ class TeamRun:
         logs: Mapping[str, Log],
         on_placement: Callable[[float, TeamPlacement], None] | None = None,
         on_sent: Callable[[str, Message], None] | None = None,
+        states: Mapping[str, RunState] | None = None,
     ) -> None:
         """:param logs: {name of a robot: its log}.
 
         :param on_placement: called with the time since the start, s, and each new answer of a robot.
         :param on_sent: called with the name of a robot and each message that it sends to the others.
+        :param states: {robot: state from which its run goes on}. How the maps lie is found again.
         """
         self._logs, self._on_placement, self._on_sent = logs, on_placement, on_sent
-        self._radios = {name: _Radio(TEAM.make(configuration, TeamState(name, "lock-step"))) for name in logs}
-        self.runs = {name: LockStepRun(configuration, observers={TEAM.name: self._radios[name]}) for name in logs}
+        begin = {name: (states or {}).get(name, RunState()) for name in logs}
+        self._radios = {
+            name: _Radio(TEAM.make(configuration, TeamState(name, _SESSION, state.processes["tlca"].replica)))
+            for name, state in begin.items()
+        }
+        self.runs = {
+            name: LockStepRun(configuration, state=state, observers={TEAM.name: self._radios[name]})
+            for name, state in begin.items()
+        }
         self._seconds = 0.0
 
     @property
