@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from dataclasses import asdict, astuple, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -202,7 +203,7 @@ def map_log(path: Path | str, configuration: Configuration) -> dict[str, MappedL
     scans = scan_records(records)
     middle, last = len(scans) // 2, last_start(len(scans))
     half = process_records(LockStepRun(configuration), records[: scans[middle]]).state
-    run = process_records(LockStepRun(configuration, state=half), records[scans[middle] :])
+    run = process_records(LockStepRun(configuration, state=deepcopy(half)), records[scans[middle] :])
     whole, result = run.state, run.finish()
     truth = result.recorder.finish(result.log_progress.stamps).trajectory
     easy = MappedLog(configuration, records, whole, scans, truth, range(last))
@@ -299,7 +300,8 @@ class StartsFile(OutcomesFile):
 
 def try_start(log: MappedLog, start: int) -> Awakening:
     """Localize the robot globally at a scan of a drive and the scans after it."""
-    run = LockStepRun(log.configuration, state=log.state)
+    # A run changes arrays of the state from which it starts.
+    run = LockStepRun(log.configuration, state=deepcopy(log.state))
     run.lock_step.feed(PoseReset())
     found, right, wrong = math.inf, False, False
     probability, right_at_first, off = 0.0, False, 0.0

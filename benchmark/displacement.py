@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -149,7 +150,8 @@ def displace(drive: MappedDrive, splice: Splice) -> Displacement:
     """Continue a drive elsewhere, for 25 m of path."""
     whole = drive.whole
     stamps = {whole.records[scan].measurement.stamp: pose for scan, pose in zip(whole.scans, whole.truth, strict=True)}
-    monitored = MonitoredRun(whole.configuration, drive.states[splice.left], stamps)
+    # A run changes arrays of the state from which it starts, and several start from each.
+    monitored = MonitoredRun(whole.configuration, deepcopy(drive.states[splice.left]), stamps)
     reports, traveled = list[LocalizationReport](), 0.0
     travel = path_lengths(whole.truth[splice.joined :])
     true = iter(whole.truth[splice.joined :])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,7 +58,7 @@ def map_drive(path: Path | str, configuration: Configuration) -> MappedDrive:
         follow(run, records[begin:end], watch)
         if end in stops:
             states[stops[end]] = run.state
-            run = LockStepRun(configuration, state=run.state)
+            run = LockStepRun(configuration, state=deepcopy(run.state))
     whole, result = run.state, run.finish()
     recording = result.recorder.finish(result.log_progress.stamps)
     truth = final_map(recording, lambda: deskewed_scans(log, configuration), configuration).recording.trajectory

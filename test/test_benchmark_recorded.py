@@ -235,6 +235,8 @@ class TestMappedWorld:
         assert found.scores.noticed <= SOON
         assert found.scores.again < 10.0
         assert found.wrong is None
+        # Others that start from the same state have it as it was.
+        assert displace(office, draw_splice(office, number)).document == found.document
 
 
 def test_the_bundled_log_is_measured_and_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
