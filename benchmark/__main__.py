@@ -61,6 +61,7 @@ MEASUREMENTS = {
     "disambiguation": "path until a robot is sure of its place, driving to where a look decides, or on",
     "merge": "maps of halves of a drive that are made apart and joined",
     "team": "robots that map at once from unknown starts: joins, right or wrong, and the path until then",
+    "team_exploration": "exploration of an institute by two robots, and by one",
     "laps": "memory, cost and errors over repeated laps on known ground",
     "changes": "maps of changing worlds in mode lifelong, among people",
     "scale": "time and memory in maps of up to 100,000 areas",

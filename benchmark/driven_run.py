@@ -25,7 +25,7 @@ from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.driven_robot import DrivenLog, DrivenRobot
 
 
-class _RobotProcess:
+class RobotProcess:
     """The robot as a process: it applies velocity commands, and keeps the last task result."""
 
     def __init__(self, robot: DrivenRobot) -> None:
@@ -66,7 +66,7 @@ class DrivenRun(Generic[Driver]):
         """
         self.robot = robot
         self.driver: Driver = driver
-        self._robot_process = _RobotProcess(robot)
+        self._robot_process = RobotProcess(robot)
         name = "explorer" if isinstance(driver, Explorer) else "pilot"
         self._run = LockStepRun(configuration, state=state, observers={name: driver, "robot": self._robot_process})
         log = DrivenLog("driven", robot)

@@ -25,6 +25,7 @@ from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.landmarks.openings import distance_to_doors, jamb_positions
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.ambiguity import NOT_DRIVEN, Ambiguity, Look
+from hmt_slam_ros.messages.map_changes import ForeignGround, ForeignKeyframe
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, HypothesisEstimate, Keyframe
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.tasks import EXPLORER_TASKS, GoalPose, Task, TaskResult, VelocityCommand, parse_task
@@ -38,6 +39,9 @@ from hmt_slam_ros.simulation.settings import Settings
 
 ROOMS = np.array([[3.0, -3.2], [9.0, -3.2]])
 """Middles of the rooms, m."""
+
+ORIGIN = np.array([1.0, 0.0, 0.0])
+"""Where the robot begins, m and rad."""
 
 LASER = Settings(field_of_view=360.0, beams=720)
 
@@ -105,6 +109,32 @@ def test_explores_all_of_a_floor_hallways_first() -> None:
     entered = [int(np.argmax(np.hypot(*(path - room).T) < 1.9)) for room in ROOMS]
     arm, end = (int(np.argmax(np.hypot(*(path - place).T) < 3.5)) for place in ((6.0, 8.0), (11.0, 0.0)))
     assert min(entered) > max(arm, end) > 0
+
+
+def test_ground_of_another_robot_is_known_and_what_is_nearer_to_it_is_left_to_it() -> None:
+    own = _Explored(explore=False)
+    own.run.run_task(Task("explore"), 16.0)
+    explorer = own.run.driver
+    known = explorer.exploration_map
+    # To the end of the arm, where another robot has been; that is in the door of the left room now.
+    assert target_in_building(explorer) == pytest.approx((6.0, 8.0), abs=1.0)
+    places = [(6.0, 2.0, 1.6), (6.0, 5.0, 1.6), (6.0, 8.0, 1.6), (6.0, 5.0, -1.6), (3.0, -1.0, -1.6)]
+    keyframes = [ForeignKeyframe(-2 - n, 0, np.array(place) - ORIGIN, scan_at(place)) for n, place in enumerate(places)]
+    ground = ForeignGround("bob", tuple(keyframes))
+    best = known.replica.best_hypothesis
+    explorer.handle(ClosureDecision(known.event, best, (), (), foreign_ground=ground))
+    own.run.run_task(Task("explore"), 2.0)
+    assert known.teammates.positions() == {"bob": -6} and not known.teammates.new_keyframes
+    # Not the left room: the eastern half.
+    x, y = target_in_building(explorer)
+    assert x > 7.0 and y < 1.0
+
+
+def target_in_building(explorer: Explorer) -> Float64:
+    """The frontier to which an explorer drives, (2,), m."""
+    target, locator = explorer._target, explorer.exploration_map.keyframe_locator
+    assert target is not None
+    return se2.transform(locator.keyframe_pose(target.keyframe), target.path[-1]) + ORIGIN[:2]
 
 
 def test_rooms_have_names_and_the_robot_goes_there() -> None:

@@ -1,5 +1,7 @@
 """A map that is shared with other robots, as updates that may be lost, come twice, late or in parts."""
 
+from dataclasses import replace
+
 import numpy as np
 import worlds
 
@@ -135,6 +137,30 @@ def test_what_hypotheses_have_in_different_ways_stays_as_it_was_shared():
     assert not robot.shared.take_over(Replica(robot.scans, maps, {0: 0.5, 1: 0.5}, {0: 1, 1: 1}))
     receive(foreign, robot)
     assert_same(foreign, robot, [0])
+
+
+def test_a_keyframe_that_moved_is_in_one_area():
+    """The robot's area is divided, and the part that it is in comes later."""
+    robot, foreign = Robot(), ForeignMap(ForeignMapState("a"))
+    robot.map_keyframes(0, 2 * NEW_KEYFRAMES)
+    receive(foreign, robot)
+    moved = range(NEW_KEYFRAMES)
+    for k in moved:
+        robot.map.set_keyframe(k, 1, robot.map.keyframes(0)[k])
+        robot.map.remove_keyframe(k, 0)
+    robot.join(0, 1)
+    update = robot.shared.update_after(foreign.version)
+    areas = tuple(area for area in update.areas if area.area == 1)
+    assert foreign.apply(replace(update, areas=areas))
+    found = foreign.component().hybrid_map
+    assert {area: list(found.keyframes(area)) for area in found.area_ids()} == {
+        0: list(range(NEW_KEYFRAMES, 2 * NEW_KEYFRAMES)),
+        1: list(moved),
+    }
+    # Without a loss both come at once.
+    other = ForeignMap(ForeignMapState("a"))
+    receive(other, robot)
+    assert_same(other, robot, [0, 1])
 
 
 def test_a_large_map_comes_in_parts(monkeypatch):

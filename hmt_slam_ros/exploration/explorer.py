@@ -8,6 +8,7 @@ end the last arm that was left out.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.exploration.look_planner import LookPlanner
 from hmt_slam_ros.exploration.path_follower import KeyframeLocator, PathFollower, Route, motion_limits
 from hmt_slam_ros.exploration.roadmap import EntryPoint, Frontier, Roadmap
+from hmt_slam_ros.exploration.teammates import Cost, Teammates, choose_frontier
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.logs.stamps import NANOSECONDS
@@ -52,6 +54,7 @@ class ExplorationMap:
     :ivar roadmap: of the building.
     :ivar replica: maps and scans.
     :ivar event: the last keyframe event, -1 before the first.
+    :ivar teammates: robots whose ground is part of the map.
     """
 
     def __init__(self, configuration: Configuration, replica: Replica | None = None) -> None:
@@ -60,6 +63,7 @@ class ExplorationMap:
         self.roadmap = Roadmap(configuration.features, parameters.radius + parameters.margin, parameters.door)
         self.replica = replica or Replica()
         self.event = -1
+        self.teammates = Teammates()
         self._pose: RealTimePose | None = None
         self._keyframe_locator: KeyframeLocator | None = None
         # Of each entered room the keyframes around the robot's pose there, the nearest first.
@@ -75,6 +79,8 @@ class ExplorationMap:
             self._keyframe_locator = None
             if isinstance(message, ClosureDecision):
                 self.event = message.sequence
+                if message.foreign_ground is not None:
+                    self.teammates.add(message.foreign_ground)
         elif isinstance(message, RealTimePose):
             self._pose = message
 
@@ -112,9 +118,22 @@ class ExplorationMap:
         return self._keyframe_locator
 
     def update_roadmap(self) -> EntryPoint | None:
-        """Update the roadmap around the robot, and return the path to it, None for none."""
+        """Update the roadmap around the robot, and return the path to it, None for none.
+
+        Before that, it is updated at a keyframe of another robot, where there is a new one.
+        """
+        self._update_at_teammates()
         pose = self.pose
         return self.roadmap.update(self.hybrid_map, self.replica.scans, pose.area, pose.pose_in_area.mean)
+
+    def _update_at_teammates(self) -> None:
+        """Update the roadmap around the oldest keyframe of another robot that it does not have yet."""
+        waiting, hybrid_map = self.teammates.new_keyframes, self.hybrid_map
+        while waiting and (waiting[0] in self.roadmap.graph or waiting[0] not in self.keyframe_locator):
+            waiting.pop(0)
+        if waiting:
+            area, pose = self.keyframe_locator.area_and_pose(waiting.pop(0))
+            self.roadmap.update(hybrid_map, self.replica.scans, area, pose)
 
     def route_in_base(self, route: Route) -> Float64:
         """The points of a route (n, 2) in the frame of the base now, m."""
@@ -210,6 +229,7 @@ class Explorer:
         """Choose a goal if there is none, and follow the route."""
         outputs: list[Message] = []
         ready = self.exploration_map.is_localized(scan.stamp)
+        self.exploration_map.teammates.update(scan.stamp)
         self._look_planner.update(self.exploration_map.event)
         if ready and self._task is not None:
             if self.exploration_map.has_changed and not self._keeps_route():
@@ -228,6 +248,8 @@ class Explorer:
             return self._is_looking and self._look_planner.keeps_target(self.exploration_map.keyframe_locator, robot)
         if self._is_backtracking or self._is_ambiguous:
             return self._is_backtracking and self._is_ambiguous
+        if self._is_exploring and self.exploration_map.teammates.new_keyframes:
+            return False
         in_hallway = self._is_exploring and self._target is not None and self._target.is_in_hallway
         return not (in_hallway and self._path_follower.remaining < _RESELECT_DISTANCE)
 
@@ -304,19 +326,30 @@ class Explorer:
         self._path_follower = PathFollower(self._limits, tolerance)
 
     def _plan_to_frontier(self, here: EntryPoint) -> list[Message]:
-        """Plan to the nearest frontier in a hallway, else to the nearest one."""
+        """Plan to the nearest frontier in a hallway, else to the nearest one; stand where all are left to others."""
         roadmap = self.exploration_map.roadmap
-        distances = roadmap.distances(here.keyframe)
-        choices = [
-            (not frontier.is_in_hallway, distances[frontier.keyframe] + frontier.length, number)
-            for number, frontier in enumerate(roadmap.frontiers)
-            if frontier.keyframe in distances and not self._was_tried(frontier)
-        ]
-        if not choices:
+        left = [number for number, frontier in enumerate(roadmap.frontiers) if not self._was_tried(frontier)]
+        costs = self._frontier_costs(here.keyframe, left)
+        if not costs:
             return self._retry_or_finish()
-        target = self._target = roadmap.frontiers[min(choices)[2]]
+        others = self.exploration_map.teammates.positions()
+        number = choose_frontier(costs, {name: self._frontier_costs(k, costs) for name, k in others.items()})
+        if number is None:
+            return []
+        target = self._target = roadmap.frontiers[number]
         self._set_route(here, roadmap.shortest_path(here.keyframe, target.keyframe), target.path, _FRONTIER_TOLERANCE)
         return []
+
+    def _frontier_costs(self, start: int, numbers: Iterable[int]) -> dict[int, Cost]:
+        """{number: cost from a keyframe on} of those frontiers that can be reached."""
+        roadmap = self.exploration_map.roadmap
+        distances = roadmap.distances(start) if start in roadmap.graph else {}
+        frontiers = {number: roadmap.frontiers[number] for number in numbers}
+        return {
+            number: (not frontier.is_in_hallway, distances[frontier.keyframe] + frontier.length)
+            for number, frontier in frontiers.items()
+            if frontier.keyframe in distances
+        }
 
     def _retry_or_finish(self) -> list[Message]:
         """Retry frontiers that were given up, maybe because of people, while any of them is reached; else finish."""

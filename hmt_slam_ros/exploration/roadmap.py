@@ -20,7 +20,7 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.exploration.frontiers import KEYFRAME_RANGE, NavigationGrid
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME, HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import Neighborhood, areas_around
 from hmt_slam_ros.landmarks.area_classes import hallway_log_odds, measure_free_space
 from hmt_slam_ros.landmarks.line_extraction import extract_lines
@@ -285,9 +285,9 @@ class Roadmap:
         return list(nx.dijkstra_path(self.graph, start, end, weight="length"))
 
     def backtracking_path(self, start: int) -> list[int]:
-        """The path back over all earlier keyframes, the newest first, with shortest paths between them."""
+        """The path back over the robot's earlier keyframes, the newest first, with shortest paths between them."""
         path = [start]
-        for keyframe in sorted((each for each in self.distances(start) if each < start), reverse=True):
+        for keyframe in sorted((each for each in self.distances(start) if NO_KEYFRAME < each < start), reverse=True):
             path += self.shortest_path(path[-1], keyframe)[1:]
         return path
 

@@ -74,7 +74,7 @@ class GroundTaker:
             ends = frozenset([(a, b)])
         ends_removed = tuple(ArcEnds(a, b) for a, b in sorted([*removed, *left]))
         numbers = ForeignNumbers(ground.session, self.areas, self.keyframes, ends)
-        return ForeignGround(keyframes, (*arcs, *joining), ends_removed), numbers
+        return ForeignGround(ground.robot, keyframes, (*arcs, *joining), ends_removed), numbers
 
     def _new_keyframes(self, ground: JoinedGround) -> Iterator[ForeignKeyframe]:
         scans = {item.keyframe: item.scan for item in ground.scans}

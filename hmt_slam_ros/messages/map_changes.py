@@ -156,11 +156,13 @@ class ForeignKeyframe:
 class ForeignGround:
     """What becomes part of the robot's map of the ground of another one, with the robot's numbers.
 
+    :ivar robot: name of the other one.
     :ivar keyframes: those that are new.
     :ivar arcs: arcs that are new or replaced, also to areas of the robot's own ground.
     :ivar removed_arcs: arcs that are removed.
     """
 
+    robot: str
     keyframes: tuple[ForeignKeyframe, ...] = ()
     arcs: tuple[Arc, ...] = ()
     removed_arcs: tuple[ArcEnds, ...] = ()

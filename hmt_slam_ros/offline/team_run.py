@@ -10,6 +10,7 @@ from operator import itemgetter
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.logs.records import Log, LogRecord
 from hmt_slam_ros.messages.messages import Message
+from hmt_slam_ros.messages.routing import Process
 from hmt_slam_ros.messages.team import JoinedGround, TeamPlacement
 from hmt_slam_ros.offline.lock_step import LockStepRun, RunResult
 from hmt_slam_ros.process_table import TEAM
@@ -46,12 +47,14 @@ class TeamRun:
         on_placement: Callable[[float, TeamPlacement], None] | None = None,
         on_sent: Callable[[str, Message], None] | None = None,
         states: Mapping[str, RunState] | None = None,
+        observers: Mapping[str, Mapping[str, Process]] | None = None,
     ) -> None:
         """:param logs: {name of a robot: its log}.
 
         :param on_placement: called with the time since the start, s, and each new answer of a robot.
         :param on_sent: called with the name of a robot and each message that it sends to the others.
         :param states: {robot: state from which its run goes on}. How the maps lie is found again.
+        :param observers: {robot: {name: process}}, additional processes that receive the messages of its chain.
         """
         self._logs, self._on_placement, self._on_sent = logs, on_placement, on_sent
         begin = {name: (states or {}).get(name, RunState()) for name in logs}
@@ -60,7 +63,9 @@ class TeamRun:
             for name, state in begin.items()
         }
         self.runs = {
-            name: LockStepRun(configuration, state=state, observers={TEAM.name: self._radios[name]})
+            name: LockStepRun(
+                configuration, state=state, observers={TEAM.name: self._radios[name], **(observers or {}).get(name, {})}
+            )
             for name, state in begin.items()
         }
         self._seconds = 0.0

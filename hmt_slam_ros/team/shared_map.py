@@ -209,7 +209,7 @@ def _is_due(known: _Content | None, content: _Content, is_occupied: bool) -> boo
     """Whether an area is to be shared: it changed, and the robot has left it or mapped more of it."""
     if known is None:
         return len(content.keyframes) >= (NEW_KEYFRAMES if is_occupied else 1)
-    if is_occupied:
+    if is_occupied and known.keyframes.keys() <= content.keyframes.keys():
         return len(content.keyframes) >= len(known.keyframes) + NEW_KEYFRAMES
     return not (
         content.keyframes.keys() == known.keyframes.keys()
@@ -317,11 +317,18 @@ class ForeignMap:
         return scans, tuple(item for item in self._areas.values() if item.version > version)
 
     def component(self) -> Component:
-        """The map as a component: all that informative arcs join with its first area."""
-        hybrid_map = HybridMap()
-        for number, area in sorted(self._areas.items()):
+        """The map as a component: all that informative arcs join with its first area.
+
+        A keyframe that moved to another area may be in both until all has arrived: it is in the newer one.
+        """
+        hybrid_map, placed = HybridMap(), set[int]()
+        for area in sorted(self._areas.values(), key=lambda area: -area.version):
             if all(keyframe in self._scans for keyframe in area.keyframes):
-                hybrid_map.changed_areas[number] = dict(zip(area.keyframes, area.poses, strict=True))
+                poses = zip(area.keyframes, area.poses, strict=True)
+                own = {keyframe: pose for keyframe, pose in poses if keyframe not in placed}
+                placed |= own.keys()
+                if own:
+                    hybrid_map.changed_areas[area.area] = own
         for area in self._areas.values():
             for arc in area.arcs:
                 if hybrid_map.has_area(arc.source) and hybrid_map.has_area(arc.target):
