@@ -25,7 +25,7 @@ from hmt_slam_ros.messages.team import TeamPlacement
 from hmt_slam_ros.offline.team_run import TeamRun
 from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.results.merged_map import describe_meeting, read_team, write_merged
-from hmt_slam_ros.results.output_folder import atomic_output, map_writer, robot_folder, write_output
+from hmt_slam_ros.results.output_folder import atomic_output, map_writer, robot_folder, robot_folders, write_output
 from hmt_slam_ros.team.team_map import merge_components
 
 
@@ -60,8 +60,8 @@ def _sources(options: argparse.Namespace) -> dict[str, tuple[Path, Path | None]]
     robots = {robot_folder(n): path for n, path in enumerate([options.log, *options.others], 1)}
     if options.source is None:
         return {name: (path, None) for name, path in robots.items()}
-    there = [each.name for each in options.source.glob(f"{robot_folder(0)[:-1]}*")] if options.source.is_dir() else []
-    if sorted(there) != sorted(robots):
+    there = robot_folders(options.source)
+    if there != sorted(robots):
         found = f"the results of {len(there)} robots" if there else "no results of a team"
         raise HmtSlamError(
             f"{options.source} has {found}, and {len(robots)} logs are given: with --team, --from is the output folder "

@@ -137,6 +137,11 @@ def robot_folder(number: int) -> str:
     return f"robot_{number}"
 
 
+def robot_folders(directory: Path) -> list[str]:
+    """Names of the output folders of robots in that of their team, none where it is no such folder."""
+    return sorted(each.name for each in directory.glob("robot_*")) if directory.is_dir() else []
+
+
 def check_replaceable(directory: Path) -> None:
     """Check that writing to a path loses no data.
 
