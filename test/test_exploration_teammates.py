@@ -21,14 +21,15 @@ def ground(robot, *keyframes):
     [
         ({0: (HALLWAY, 5.0), 1: (ROOM, 1.0)}, {}, 0),
         # The other one is nearer to it.
-        ({0: (HALLWAY, 5.0), 1: (HALLWAY, 6.0)}, {"bob": {0: (HALLWAY, 4.0), 1: (HALLWAY, 9.0)}}, 1),
-        ({0: (HALLWAY, 5.0), 1: (HALLWAY, 6.0)}, {"bob": {0: (HALLWAY, 5.5), 1: (HALLWAY, 4.0)}}, 0),
-        # One frontier is left, and it is the other's.
-        ({0: (ROOM, 5.0)}, {"bob": {0: (ROOM, 4.0)}}, None),
+        ({0: (HALLWAY, 5.0), 1: (HALLWAY, 6.0)}, {"bob": {0: (HALLWAY, 2.0), 1: (HALLWAY, 9.0)}}, 1),
+        ({0: (HALLWAY, 5.0), 1: (HALLWAY, 6.0)}, {"bob": {0: (HALLWAY, 3.5), 1: (HALLWAY, 2.0)}}, 0),
+        # One frontier is left, and it is the other's, where that is certainly nearer.
+        ({0: (ROOM, 5.0)}, {"bob": {0: (ROOM, 2.0)}}, None),
+        ({0: (ROOM, 5.0)}, {"bob": {0: (ROOM, 4.0)}}, 0),
         ({0: (ROOM, 5.0)}, {"bob": {}}, 0),
         # Three robots, each another one.
         (
-            {0: (ROOM, 2.0), 1: (ROOM, 3.0), 2: (ROOM, 9.0)},
+            {0: (ROOM, 5.0), 1: (ROOM, 6.0), 2: (ROOM, 9.0)},
             {"bob": {0: (ROOM, 1.0), 1: (ROOM, 3.5)}, "cid": {1: (ROOM, 1.0)}},
             2,
         ),

@@ -14,6 +14,12 @@ from hmt_slam_ros.messages.map_changes import ForeignGround
 Cost = tuple[bool, float]
 """Of a frontier for a robot: whether it is in no hallway, then the path to it, m."""
 
+_LAG = 2.5
+"""Added to the path of another robot, m: it is shown where it was up to five keyframes ago.
+
+Without it two robots may stand, each for the other.
+"""
+
 _TIMEOUT = 60 * NANOSECONDS
 """Time without new ground after which nothing is left to a robot: it may have stopped, ns."""
 
@@ -50,9 +56,11 @@ def choose_frontier(own: Mapping[int, Cost], others: Mapping[str, Mapping[int, C
     """The frontier that is this robot's, None where all are left to others.
 
     :param own: {frontier: its cost for this robot}.
-    :param others: {other robot: the same}.
+    :param others: {other robot: the same, from its newest keyframe on}.
     """
-    costs: dict[str, Mapping[int, Cost]] = {"": own, **others}
+    costs: dict[str, Mapping[int, Cost]] = {"": own}
+    for name, each in others.items():
+        costs[name] = {frontier: (is_last, path + _LAG) for frontier, (is_last, path) in each.items()}
     pairs = sorted((cost, name, frontier) for name, each in costs.items() for frontier, cost in each.items())
     assigned: dict[str, int] = {}
     for _, name, frontier in pairs:
