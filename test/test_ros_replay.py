@@ -236,7 +236,7 @@ def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path, preloaded
         os.kill(preloaded_nodes["aam"], signal.SIGSTOP)
 
     with pytest.raises(HmtSlamError, match="the run waits for the node aam"):
-        replay(log, out, load_configuration(settings=["robot.rate=1.0"]), stop, stall_timeout=10.0)
+        replay(log, out, load_configuration(settings=["robot.rate=1.0"]), stop, stall_timeout=6.0)
     assert not out.exists()
     assert not any(is_alive(pid) for pid in preloaded_nodes.values())
 

@@ -22,7 +22,7 @@ from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.topics import DIAGNOSTICS
 
-SCANS = 40
+SCANS = 32
 DAY = 86_400 * SECOND
 OF_BOTH = {"robot__flow_control": False, "robot__scan_listeners": 2, "robot__odometry_listeners": 4}
 """Parameters of a robot that waits for the nodes of both systems, and not for their answers."""
