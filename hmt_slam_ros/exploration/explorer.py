@@ -19,7 +19,7 @@ from hmt_slam_ros.exploration.path_follower import KeyframeLocator, PathFollower
 from hmt_slam_ros.exploration.roadmap import EntryPoint, Frontier, Roadmap
 from hmt_slam_ros.exploration.teammates import Cost, Teammates, choose_frontier
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME, HybridMap
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.ambiguity import Ambiguity
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message, RealTimePose
@@ -41,6 +41,9 @@ _RESELECT_DISTANCE = 3.0
 
 _SAME_FRONTIER_DISTANCE = 0.7
 """Frontiers nearer to each other than this are one, m."""
+
+_TEAMMATE_STEP = 3.0
+"""Distance of the keyframes of other robots at which the roadmap is updated, m."""
 
 _TRIES = 3
 """Routes to a place before a task is given up."""
@@ -64,6 +67,7 @@ class ExplorationMap:
         self.replica = replica or Replica()
         self.event = -1
         self.teammates = Teammates()
+        self._updated_at = NO_KEYFRAME
         self._pose: RealTimePose | None = None
         self._keyframe_locator: KeyframeLocator | None = None
         # Of each entered room the keyframes around the robot's pose there, the nearest first.
@@ -127,13 +131,22 @@ class ExplorationMap:
         return self.roadmap.update(self.hybrid_map, self.replica.scans, pose.area, pose.pose_in_area.mean)
 
     def _update_at_teammates(self) -> None:
-        """Update the roadmap around the oldest keyframe of another robot that it does not have yet."""
-        waiting, hybrid_map = self.teammates.new_keyframes, self.hybrid_map
-        while waiting and (waiting[0] in self.roadmap.graph or waiting[0] not in self.keyframe_locator):
-            waiting.pop(0)
-        if waiting:
-            area, pose = self.keyframe_locator.area_and_pose(waiting.pop(0))
-            self.roadmap.update(hybrid_map, self.replica.scans, area, pose)
+        """Update the roadmap around the oldest keyframe of another robot that is not beside the one before."""
+        waiting, locator = self.teammates.new_keyframes, self.keyframe_locator
+        while waiting:
+            keyframe = waiting.pop(0)
+            if keyframe in locator and not self._is_beside_updated(keyframe):
+                self._updated_at = keyframe
+                self.roadmap.update(self.hybrid_map, self.replica.scans, *locator.area_and_pose(keyframe))
+                return
+
+    def _is_beside_updated(self, keyframe: int) -> bool:
+        """Whether a keyframe is near the last one of another robot at which the roadmap was updated."""
+        locator = self.keyframe_locator
+        if self._updated_at not in locator:
+            return False
+        one, other = (locator.keyframe_pose(each) for each in (keyframe, self._updated_at))
+        return math.dist(one[:2], other[:2]) <= _TEAMMATE_STEP
 
     def route_in_base(self, route: Route) -> Float64:
         """The points of a route (n, 2) in the frame of the base now, m."""
