@@ -38,7 +38,7 @@ LONG = (
 
 def pytest_configure(config):
     """What only computes leaves the processor to nodes, which have to react within a time."""
-    if os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0":
+    if os.environ.get("PYTEST_XDIST_WORKER", "gw0") not in ("gw0", "gw1"):
         os.nice(10)
 
 
@@ -51,10 +51,10 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """The first worker takes the files in which nodes run, the others what only computes.
+    """The first two workers take the files in which nodes run, the third what only computes.
 
-    Nodes wait for each other, and have to react within a time; six of them at once are enough for two cores. Of the
-    workers that have nothing left to compute, one helps the first.
+    Nodes mostly wait for each other, so that the third has the rest of the processor. No more than two workers run
+    nodes, which have to react within a time: the third ends where nothing else is left.
     """
     from xdist.scheduler import LoadFileScheduling  # noqa: PLC0415  only where it is installed
 
@@ -66,7 +66,7 @@ def pytest_xdist_make_scheduler(config, log):
             if not self.workqueue:
                 node.shutdown()
                 return
-            runs_nodes = node is self.nodes[0]
+            runs_nodes = node in self.nodes[:2]
             for file in sorted(self.workqueue, key=lambda file: not name_of(file).startswith(LONG)):
                 if name_of(file).startswith(NODES) == runs_nodes:
                     self.workqueue.move_to_end(file, last=False)
