@@ -20,8 +20,9 @@ STEP = belief([4.0, 0.0, 0.0])
 JOIN = belief([1.0, 2.0, 0.5])
 
 
-def scans(*keyframes):
-    return tuple(SharedScan(1, k, worlds.blank_scan()) for k in keyframes)
+def scans(*keyframes, since=0):
+    """The scans of keyframes, each of its own time."""
+    return tuple(SharedScan(1, k, replace(worlds.blank_scan(), stamp=since + k)) for k in keyframes)
 
 
 def area(number, *keyframes, arcs=()):
@@ -50,7 +51,9 @@ def own_map():
 def take_over(hybrid_map, ground=GROUND, numbers=None, observed=(), first=2):
     """The map with the ground, and the numbers."""
     numbers = numbers or ForeignNumbers(ground.session)
-    next_keyframe = next_foreign_keyframe({ground.robot: numbers})
+    next_keyframe = next_foreign_keyframe(
+        {ground.robot: numbers}, (k for area in hybrid_map.area_ids() for k in hybrid_map.keyframes(area))
+    )
     taken, numbers = GroundTaker(hybrid_map, numbers, observed, first, next_keyframe).take_over(ground)
     replica = Replica({}, {0: hybrid_map})
     replica._add_foreign_ground(hybrid_map, taken)
@@ -107,6 +110,34 @@ def test_a_join_that_is_withdrawn_leaves_ground_of_which_nothing_is_known():
     np.testing.assert_array_equal(hybrid_map.arc(0, 2).mean, JOIN.mean)
 
 
+def test_a_map_that_goes_on_in_another_session_adds_what_is_new_in_it():
+    """Robot and map were saved with keyframe 1: the other keyframes of the session before are of another drive."""
+    hybrid_map = own_map()
+    _, numbers, kept = take_over(hybrid_map)
+    on = replace(GROUND, session="2", scans=(*scans(0, 1), *scans(5, since=100)))
+    taken, again, _ = take_over(hybrid_map, on, numbers.continued(on, kept), first=4)
+    assert [(new.keyframe, new.area) for new in taken.keyframes] == [(-5, 4)]
+    assert again.areas == {0: 2, 7: 4}
+    # The join is that with the area of this drive.
+    assert hybrid_map.arc(1, 3) is None and hybrid_map.arc_value(1, 4).closure
+
+
+def test_what_was_pruned_here_stays_so_in_another_session():
+    hybrid_map = own_map()
+    _, numbers, kept = take_over(hybrid_map)
+    del kept[numbers.keyframes[0]]
+    on = replace(GROUND, session="2")
+    taken, _, _ = take_over(hybrid_map, on, numbers.continued(on, kept))
+    assert taken.keyframes == ()
+
+
+def test_a_map_from_scratch_has_numbers_of_its_own():
+    _, numbers, kept = take_over(own_map())
+    other = replace(GROUND, session="2", scans=scans(0, 1, 5, since=100))
+    own = numbers.continued(other, kept)
+    assert (own.session, own.areas, own.keyframes) == ("2", {}, {})
+
+
 def test_arcs_to_areas_that_are_no_more_are_left_out():
     hybrid_map = own_map()
     gone = replace(GROUND, joining_arcs=(JoiningArc(6, 7, JOIN),))
@@ -151,6 +182,6 @@ def test_ground_waits_while_there_are_several_hypotheses(play):
 def test_ground_of_another_session_is_other_ground(play):
     play.process.handle(GROUND)
     play.step()
-    play.process.handle(replace(GROUND, session="2"))
+    play.process.handle(replace(GROUND, session="2", scans=scans(0, 1, 5, since=100)))
     decision = play.step()
     assert [new.keyframe for new in decision.foreign_ground.keyframes] == [-5, -6, -7]

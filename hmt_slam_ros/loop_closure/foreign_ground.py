@@ -6,13 +6,14 @@ other robot's, unless the robot has observed them itself.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME, AreaPair, HybridMap, area_pair
 from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
 from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, ForeignGround, ForeignKeyframe
 from hmt_slam_ros.messages.team import JoinedGround, SharedArea
+from hmt_slam_ros.sensors import Scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +30,27 @@ class ForeignNumbers:
     areas: Mapping[int, int] = field(default_factory=dict)
     keyframes: Mapping[int, int] = field(default_factory=dict)
     joining_arcs: frozenset[AreaPair] = frozenset()
+
+    def continued(self, ground: JoinedGround, scans: Mapping[int, Scan]) -> ForeignNumbers:
+        """The numbers in another session of the map: those up to the last keyframe that is the same one in both.
+
+        Nodes that start from a saved map number on from it, so that keyframes after it have the numbers of others.
+
+        :param ground: first one of the session.
+        :param scans: {number in the map: scan}.
+        """
+        stamps = {item.keyframe: item.scan.stamp for item in ground.scans}
+        same = [
+            theirs
+            for theirs, number in self.keyframes.items()
+            if theirs in stamps and number in scans and scans[number].stamp == stamps[theirs]
+        ]
+        if not same:
+            return ForeignNumbers(ground.session)
+        keyframes = {theirs: number for theirs, number in self.keyframes.items() if theirs <= max(same)}
+        common = {area.area for area in ground.areas if not keyframes.keys().isdisjoint(area.keyframes)}
+        areas = {theirs: number for theirs, number in self.areas.items() if theirs in common}
+        return ForeignNumbers(ground.session, areas, keyframes, self.joining_arcs)
 
 
 class GroundTaker:
@@ -121,7 +143,10 @@ class GroundTaker:
         return self._map.has_area(area) or area not in self._numbers.areas.values()
 
 
-def next_foreign_keyframe(numbers: Mapping[str, ForeignNumbers]) -> int:
-    """The largest number below ``NO_KEYFRAME`` that no keyframe has."""
+def next_foreign_keyframe(numbers: Mapping[str, ForeignNumbers], keyframes: Iterable[int]) -> int:
+    """The largest number below ``NO_KEYFRAME`` that no keyframe has.
+
+    :param keyframes: of the map, which may have some of earlier sessions.
+    """
     used = [keyframe for own in numbers.values() for keyframe in own.keyframes.values()]
-    return min([NO_KEYFRAME, *used]) - 1
+    return min(NO_KEYFRAME, *used, *keyframes) - 1
