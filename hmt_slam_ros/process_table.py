@@ -15,7 +15,7 @@ _MESSAGES = "hmt_slam_ros.messages.messages"
 _DOCUMENTS = "hmt_slam_ros.messages.documents"
 _ROS = "hmt_slam_ros.ros"
 _TEAM = "hmt_slam_ros.messages.team"
-_TEAM_MESSAGES = ("TeamStatus", "TeamRequest", "TeamUpdate", "TeamPlacement")
+_TEAM_MESSAGES = ("TeamStatus", "TeamRequest", "TeamUpdate", "TeamPlacement", "TeamRendezvous")
 _TOPOLOGY_NICENESS = 5  # a quarter of a core beside a program of niceness 0
 
 RUN_NODE = f"{_ROS}.run_node"
@@ -215,6 +215,7 @@ DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow(f"{_TEAM}:TeamRequest", "/team/requests", "team_request", 1),
     DocumentRow(f"{_TEAM}:TeamUpdate", "/team/updates", "team_update", 2),
     DocumentRow(f"{_TEAM}:TeamPlacement", "/team/placements", "team_placement", 1),
+    DocumentRow(f"{_TEAM}:TeamRendezvous", "/team/rendezvous", "team_rendezvous", 1),
 )
 """Messages that travel as JSON documents."""
 

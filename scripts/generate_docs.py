@@ -152,7 +152,7 @@ _FURTHER_PUBLISHED: dict[str, tuple[str, ...]] = {
     "robot": ("scan", "odom", "/clock", "hmt/robot_status", "tf", "tf_static", "ground_truth"),
     "explorer": _TASK_TOPICS,
     "pilot": (*_TASK_TOPICS, "pilot/place_estimate", "initialpose"),
-    "operator": ("initialpose", "explorer/task", "pilot/task"),
+    "operator": ("initialpose", "rendezvous", "explorer/task", "pilot/task"),
 }
 """{node: topics that follow from no message of the process table}."""
 
@@ -163,7 +163,7 @@ _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
         *("hmt/entropy", "hmt/robot_status", "diagnostics", "/team/placements"),
     ),
     "robot": ("hmt/local_estimate", "hmt/tracking_reset", "diagnostics"),
-    "team": ("hmt/reset_request",),
+    "team": ("hmt/reset_request", "rendezvous"),
     "explorer": ("hmt/reset_request", "tf_static"),
     "pilot": ("hmt/reset_request", "tf_static"),
     "recorder": ("hmt/area_events", "hmt/robot_status", "diagnostics", "hmt/cost"),

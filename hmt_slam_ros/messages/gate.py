@@ -38,6 +38,7 @@ from hmt_slam_ros.messages.team import (
     SharedScan,
     TeamMessage,
     TeamPlacement,
+    TeamRendezvous,
     TeamUpdate,
 )
 from hmt_slam_ros.plain_data import field_names, is_record
@@ -274,7 +275,7 @@ def _check_response(response: SaveResponse | ResetResponse) -> None:
 
 def _check_team_message(message: TeamMessage | JoinedGround) -> None:
     """Check the names, and what an update or a placement holds."""
-    for name in ("robot", "session", "owner", "first", "second", "digest"):
+    for name in ("robot", "session", "owner", "first", "second", "other", "digest"):
         value = getattr(message, name, "-")
         _require(bool(_TEAM_NAME.fullmatch(value)), name, value, "a name of 100 letters, digits and '_-.:+' at most")
     if isinstance(message, TeamUpdate):
@@ -284,6 +285,8 @@ def _check_team_message(message: TeamMessage | JoinedGround) -> None:
             _require(0.0 <= rate <= 1.0, "clutter", rate, "between 0 and 1")
     if isinstance(message, TeamUpdate | JoinedGround):
         _check_items(message.scans, message.areas)
+    elif isinstance(message, TeamRendezvous):
+        _require(message.other != message.robot, "other", message.other, "another robot")
     elif isinstance(message, TeamPlacement):
         _require(message.first < message.second, "second", message.second, f"a name after {message.first}")
         _require(message.robot in (message.first, message.second), "robot", message.robot, "a robot of the pair")

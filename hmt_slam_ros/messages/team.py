@@ -143,6 +143,24 @@ class TeamPlacement:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class TeamRendezvous:
+    """A robot -> all others: where it observes another one, or that both were at one place.
+
+    :ivar robot: name of the robot that says so.
+    :ivar stamp: on its clock, ns.
+    :ivar other: name of the other robot.
+    :ivar other_stamp: on the clock of that robot, ns; the same where their clocks agree, and both were there at once.
+    :ivar pose: belief over ``robot_T_other`` of their bases then.
+    """
+
+    robot: str
+    stamp: int
+    other: str
+    other_stamp: int
+    pose: PoseGaussian
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class JoiningArc:
     """An arc that joins the maps of two robots.
 
@@ -174,5 +192,5 @@ class JoinedGround:
     joining_arcs: tuple[JoiningArc, ...]
 
 
-TeamMessage = TeamStatus | TeamRequest | TeamUpdate | TeamPlacement
+TeamMessage = TeamStatus | TeamRequest | TeamUpdate | TeamPlacement | TeamRendezvous
 """What robots of a team send one another."""

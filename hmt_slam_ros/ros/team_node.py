@@ -6,22 +6,30 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Any, get_args
 
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.documents import ResetRequest, encode
-from hmt_slam_ros.messages.gate import decode_of_team
+from hmt_slam_ros.messages.gate import check_belief, check_message, decode_of_team
 from hmt_slam_ros.messages.messages import ClosureDecision, Message
-from hmt_slam_ros.messages.team import TeamMessage, TeamPlacement, TeamRequest, TeamStatus, TeamUpdate
+from hmt_slam_ros.messages.team import (
+    TeamMessage,
+    TeamPlacement,
+    TeamRendezvous,
+    TeamRequest,
+    TeamStatus,
+    TeamUpdate,
+)
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import stamp_from_time, transform_message
+from hmt_slam_ros.ros.conversions import gaussian_from_message, stamp_from_time, transform_message
 from hmt_slam_ros.ros.initial_state import InitialState
 from hmt_slam_ros.ros.message_io import subscribe_document
 from hmt_slam_ros.ros.parameters import declare_frame
 from hmt_slam_ros.ros.process_node import ProcessNode
-from hmt_slam_ros.ros.topics import DOCUMENTS, transform_publisher
+from hmt_slam_ros.ros.topics import DOCUMENTS, RENDEZVOUS, transform_publisher
 
 if TYPE_CHECKING:
     from hmt_slam_ros.team.team import Team
@@ -39,6 +47,7 @@ _PROFILES: dict[type, QoSProfile] = {
     TeamRequest: topics.STREAM,
     TeamUpdate: topics.STREAM,
     TeamPlacement: topics.TEAM_HISTORY,
+    TeamRendezvous: topics.TEAM_HISTORY,
 }
 _ROBOT_NAME = ParameterDescriptor(description="Name of the robot in its team; empty for its namespace.", read_only=True)
 _BANDWIDTH = ParameterDescriptor(
@@ -83,6 +92,7 @@ class TeamNode(ProcessNode):
         for kind, profile in _PROFILES.items():
             self.outbox.set_writer(kind, self._enqueue if kind is TeamUpdate else self._publish_to_team)
             self.create_subscription(String, DOCUMENTS[kind], self._team_callback(kind), profile)
+        self.create_subscription(PoseWithCovarianceStamped, RENDEZVOUS, self._on_rendezvous, topics.STREAM)
         self._send_transforms = transform_publisher(self, "tf")
         subscribe_document(self, ResetRequest, self._on_reset_request, topics.CHAIN)
         self.create_timer(_PERIOD, self._on_timer, clock=self.diagnostics.steady_clock)
@@ -133,6 +143,19 @@ class TeamNode(ProcessNode):
                 )
 
         return on_document
+
+    def _on_rendezvous(self, message: PoseWithCovarianceStamped) -> None:
+        """Another robot is observed: the frame is its name, and the pose that of its base in this one's."""
+        try:
+            belief = gaussian_from_message(message.pose)
+            check_belief(belief, "pose")
+            stamp, other = stamp_from_time(message.header.stamp), message.header.frame_id
+            rendezvous = TeamRendezvous(self._robot, stamp, other, stamp, belief)
+            check_message(rendezvous)
+        except HmtSlamError as fault:
+            self.diagnostics.refuse(RENDEZVOUS, fault)
+            return
+        self.deliver(rendezvous)
 
     def _publish_to_team(self, message: TeamMessage) -> None:
         """Publish for all robots, whatever their systems; what a killed node did not send is requested again."""

@@ -74,6 +74,7 @@ MAP, GRAPH, PARTICLES, PMF = "map", "hmt/graph", "hmt/particles", "hmt/pmf"
 IS_LOCALIZED, ENTROPY = "hmt/is_localized", "hmt/entropy"
 AMBIGUITY_GOAL = "hmt/ambiguity_goal"
 INITIAL_POSE = "initialpose"
+RENDEZVOUS = "rendezvous"
 DIAGNOSTICS = "diagnostics"
 
 DOCUMENTS: dict[type, str] = {row.message_class: row.topic for row in process_table.DOCUMENTS}

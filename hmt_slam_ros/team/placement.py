@@ -169,7 +169,7 @@ class PlacementGeometry:
         if there.mahalanobis2(own) > _GATE:
             return None
         spread = there.covariance_at(own.mean) + own.covariance
-        return min(0.0, 0.5 * float(np.linalg.slogdet(_SAME_PLACE)[1] - np.linalg.slogdet(spread)[1]))
+        return min(0.0, 0.5 * float(np.linalg.slogdet(own.covariance)[1] - np.linalg.slogdet(spread)[1]))
 
     def component_pose(self, first: int, second: int, match: WindowCandidate) -> Pose:
         """``first_T_second`` of two areas, one of each component, if a window lies at a candidate, shape (3,)."""

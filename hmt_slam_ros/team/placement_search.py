@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from hmt_slam_ros.configuration.tree import Configuration
@@ -12,9 +12,11 @@ from hmt_slam_ros.team.contradictions import PlaceComparison
 from hmt_slam_ros.team.placement import (
     PlacementDistribution,
     PlacementGeometry,
+    WindowCandidate,
     placement_distribution,
     window_candidates,
 )
+from hmt_slam_ros.team.rendezvous import Rendezvous, RendezvousWindow, rendezvous_window
 from hmt_slam_ros.team.windows import Window, find_windows
 from hmt_slam_ros.topological_inference.event_work import EventWork
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch
@@ -47,6 +49,7 @@ class PlacementSearch:
         self._map_search = MapSearch(configuration, self._scans, self._work)
         self._pair: ComponentPair | None = None
         self._windows: list[Window] = []
+        self._in_order: list[Window | RendezvousWindow] = []
         self._searches: dict[Keyframes, _WindowSearch] = {}
 
     @property
@@ -57,10 +60,10 @@ class PlacementSearch:
 
     @property
     def windows(self) -> tuple[Window, ...]:
-        """The windows of the second component."""
-        return tuple(self._windows)
+        """The windows of the second component, and those of rendezvous, in the order of its path."""
+        return tuple(each.window if isinstance(each, RendezvousWindow) else each for each in self._in_order)
 
-    def update(self, pair: ComponentPair) -> None:
+    def update(self, pair: ComponentPair, rendezvous: Sequence[Rendezvous] = ()) -> None:
         """Go on with components that grew or changed, with the same numbers."""
         if any(self._scans[k] is not pair.scans.get(k) for k in self._scans):
             self._map_search.forget_scans()
@@ -68,6 +71,8 @@ class PlacementSearch:
         self._scans |= pair.scans
         self._pair = pair
         self._windows = find_windows(pair.hybrid_map, pair.other, self._windows)
+        met = [window for each in rendezvous if (window := rendezvous_window(pair, each)) is not None]
+        self._in_order = sorted([*self._windows, *met], key=_first_keyframe)
         known = {area: tuple(pair.hybrid_map.keyframes(area)) for area in pair.known}
         earlier = self._searches
         self._searches = {
@@ -110,12 +115,21 @@ class PlacementSearch:
 
     def distribution(self) -> PlacementDistribution:
         """The PMF over placements, as far as it was searched."""
-        pair = self.pair
+        pair, windows = self.pair, self.windows
         known = len(pair.known)
-        candidates = [
-            window_candidates(n, self._map_search.localize(pair.hybrid_map, own.search, pair.clutter), known)
-            for n, own in enumerate(self._searches.values())
-        ]
-        geometry = PlacementGeometry(pair.hybrid_map, self._windows)
-        comparison = PlaceComparison(pair, self._windows, geometry, self._configuration, self._map_search.grid_cache)
+        candidates = [self._candidates(number, each) for number, each in enumerate(self._in_order)]
+        geometry = PlacementGeometry(pair.hybrid_map, windows)
+        comparison = PlaceComparison(pair, windows, geometry, self._configuration, self._map_search.grid_cache)
         return placement_distribution(geometry, candidates, pair.joint, known, comparison.log_ratio)
+
+    def _candidates(self, number: int, window: Window | RendezvousWindow) -> list[WindowCandidate]:
+        if isinstance(window, RendezvousWindow):
+            return [window.candidate(number)]
+        pair, search = self.pair, self._searches[tuple(window.poses)].search
+        found = self._map_search.localize(pair.hybrid_map, search, pair.clutter)
+        return window_candidates(number, found, len(pair.known))
+
+
+def _first_keyframe(window: Window | RendezvousWindow) -> int:
+    own = window.window if isinstance(window, RendezvousWindow) else window
+    return next(iter(own.poses))

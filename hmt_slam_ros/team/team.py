@@ -15,6 +15,7 @@ from hmt_slam_ros.messages.team import (
     MAX_TEAM_KEYFRAMES,
     JoinedGround,
     TeamPlacement,
+    TeamRendezvous,
     TeamRequest,
     TeamStatus,
     TeamUpdate,
@@ -24,6 +25,7 @@ from hmt_slam_ros.team.components import Shift, combine
 from hmt_slam_ros.team.join import Meeting, judge
 from hmt_slam_ros.team.lasting_join import JoinState, next_join
 from hmt_slam_ros.team.placement_search import PlacementSearch
+from hmt_slam_ros.team.rendezvous import KnownRendezvous
 from hmt_slam_ros.team.shared_map import ForeignMap, ForeignMapState, SharedMap, SharedMapState
 from hmt_slam_ros.team.team_frame import team_poses
 
@@ -51,6 +53,7 @@ class TeamState:
     :ivar others: {other robot: its map}.
     :ivar joins: {other robot: how far the join with it is}.
     :ivar placements: what this robot and others found.
+    :ivar rendezvous: of this robot with others.
     """
 
     robot: str
@@ -60,6 +63,7 @@ class TeamState:
     others: Mapping[str, ForeignMapState] = field(default_factory=dict)
     joins: Mapping[str, JoinState] = field(default_factory=dict)
     placements: tuple[TeamPlacement, ...] = ()
+    rendezvous: tuple[TeamRendezvous, ...] = ()
 
 
 class _PairState:
@@ -117,6 +121,7 @@ class Team:
         self._others = {name: _Other(own) for name, own in state.others.items()}
         self._pairs = {name: _PairState(configuration, state.joins.get(name, JoinState())) for name in state.others}
         self._placements = {(each.robot, each.first, each.second): each for each in state.placements}
+        self._rendezvous = KnownRendezvous(state.robot, state.rendezvous)
         self.map_poses = team_poses(state.robot, state.placements)
         self._update_own()
 
@@ -131,6 +136,7 @@ class Team:
             {name: other.map.state for name, other in self._others.items()},
             {name: pair.join for name, pair in self._pairs.items()},
             tuple(self._placements.values()),
+            self._rendezvous.state,
         )
 
     @property
@@ -160,24 +166,28 @@ class Team:
     def handle(self, message: Message) -> list[Message]:
         """Process a message of the robot's own chain, or of another robot; the own status lets the search go on."""
         match message:
-            case Keyframe():
-                self._replica.apply_message(message)
-                self._note_clutter(message)
-            case Hypotheses():
-                self._replica.apply_message(message)
-            case ClosureDecision():
-                self._replica.apply_decision(message)
-                return [*self._share(), *self.search(_STEPS)]
+            case Keyframe() | Hypotheses() | ClosureDecision():
+                return self._follow_chain(message)
             case TeamStatus():
-                if message.robot == self._robot:
-                    return self.search(_STEPS, may_wait=False)
                 return self._on_status(message)
             case TeamRequest():
                 return self._on_request(message)
             case TeamUpdate():
                 return self._on_update(message)
+            case TeamRendezvous():
+                return self._on_rendezvous(message)
             case TeamPlacement():
                 self._note_placement(message)
+        return []
+
+    def _follow_chain(self, message: Keyframe | Hypotheses | ClosureDecision) -> list[Message]:
+        """Follow the robot's map; a decision is shared."""
+        if isinstance(message, ClosureDecision):
+            self._replica.apply_decision(message)
+            return [*self._share(), *self.search(_STEPS)]
+        self._replica.apply_message(message)
+        if isinstance(message, Keyframe):
+            self._note_clutter(message)
         return []
 
     def _note_clutter(self, keyframe: Keyframe) -> None:
@@ -201,9 +211,11 @@ class Team:
         """Request what the robot's map has more than is known here.
 
         While a request is under way, a newer status waits for its answer. Where the same status comes again, and
-        nothing has arrived meanwhile, the answer was lost.
+        nothing has arrived meanwhile, the answer was lost. The own status lets the search go on.
         """
         name = status.robot
+        if name == self._robot:
+            return self.search(_STEPS, may_wait=False)
         if name not in self._others and len(self._others) == MAX_ROBOTS:
             return []
         known = self._others.get(name)
@@ -254,6 +266,13 @@ class Team:
             self._placements[placement.robot, placement.first, placement.second] = placement
             self.map_poses = team_poses(self._robot, self._placements.values())
 
+    def _on_rendezvous(self, rendezvous: TeamRendezvous) -> list[Message]:
+        """Keep a rendezvous for the next comparison; the others get what this robot observed."""
+        other = self._rendezvous.add(rendezvous)
+        if other in self._pairs:
+            self._pairs[other].is_outdated = True
+        return [rendezvous] if other and rendezvous.robot == self._robot else []
+
     def _forget_placements(self, name: str) -> None:
         """Forget how a map lay that is no more."""
         self._placements = {key: each for key, each in self._placements.items() if name not in key}
@@ -290,7 +309,7 @@ class Team:
         own, other = self._own.component(), self._others[name].map.component()
         if own.scans and other.scans:
             first, second = (own, other) if self._robot < name else (other, own)
-            pair.search.update(combine(first, second, _SHIFT))
+            pair.search.update(combine(first, second, _SHIFT), self._rendezvous.with_robot(name))
             pair.is_judged = False
 
     def _judge(self, name: str, pair: _PairState) -> list[Message]:

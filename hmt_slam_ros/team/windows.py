@@ -35,7 +35,7 @@ class Window:
     """Successive keyframes of a component in one frame.
 
     :ivar area: that of the first keyframe.
-    :ivar reference: shape (3,), ``area_T_reference``, the pose of the first keyframe.
+    :ivar reference: shape (3,), ``area_T_reference``, the pose of the first keyframe; of the robot in a rendezvous.
     :ivar poses: {keyframe: ``reference_T_base``, shape (3,)}, ascending.
     """
 

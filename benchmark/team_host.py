@@ -1,0 +1,186 @@
+"""A robot of a team on a host of its own: the node ``team``, and the rest of its chain, which is recorded before.
+
+    python -m benchmark.team_host NAME WORLD LAP FOLDER
+
+Reads commands, one a line: ``start``, ``kill``, ``play SHARE``, ``end``. Prints what it sees once a second, as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import String
+
+from benchmark.runs import PARAMETERS
+from hmt_slam_ros.configuration import load_configuration
+from hmt_slam_ros.messages.documents import KeyframeHeader, decode, encode
+from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message
+from hmt_slam_ros.messages.team import TeamPlacement, TeamStatus
+from hmt_slam_ros.offline.lock_step import LockStepRun
+from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.process_table import TEAM, node_command
+from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.conversions import keyframe_frame, scan_message
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAME_SCANS, KEYFRAMES
+
+_DOMAIN = 7
+_SPIN = 0.01  # s
+_PERIOD = 1.0  # s
+_INTERVAL = 0.02
+"""Time between two messages of the chain, s."""
+
+
+class _Chain:
+    """Keeps the messages of the chain."""
+
+    def __init__(self) -> None:
+        self.messages: list[Message] = []
+
+    def handle(self, message: Message) -> list[Message]:
+        """Keep a message."""
+        self.messages.append(message)
+        return []
+
+
+def chain_of(world: str, lap: int) -> list[Message]:
+    """What the process team of a robot receives that drives one of two laps."""
+    chain, half = _Chain(), 0.5 * open_log(world).duration
+    run = LockStepRun(load_configuration(PARAMETERS, []), observers={TEAM.name: chain})
+    for record in run.unread_records(open_log(world, start=lap * half, duration=half)):
+        run.process_record(record)
+    return chain.messages
+
+
+class _Host:
+    """The node ``team``, and the node that plays the chain to it."""
+
+    def __init__(self, name: str, messages: Sequence[Message], folder: Path) -> None:
+        """:param folder: of the state of a node that was killed."""
+        self._name, self._messages, self._folder = name, messages, folder
+        self._played, self._until, self._share, self._next_at = 0, 0, 0.0, 0.0
+        self._process: subprocess.Popen[bytes] | None = None
+        self._status: TeamStatus | None = None
+        self._placements: dict[str, TeamPlacement] = {}
+        self._values: dict[str, str] = {}
+        context = Context()
+        context.init(domain_id=_DOMAIN)
+        self._node = Node("chain", context=context, namespace=name)
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self._node)
+        types = {KEYFRAMES: String, KEYFRAME_SCANS: LaserScan}
+        types |= {DOCUMENTS[kind]: String for kind in (Hypotheses, ClosureDecision)}
+        self._publishers = {
+            topic: self._node.create_publisher(kind, topic, topics.CHAIN_HISTORY) for topic, kind in types.items()
+        }
+        self._node.create_subscription(String, DOCUMENTS[TeamStatus], self._on_status, topics.TEAM_HISTORY)
+        self._node.create_subscription(String, DOCUMENTS[TeamPlacement], self._on_placement, topics.TEAM_HISTORY)
+        self._node.create_subscription(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, topics.STREAM)
+
+    def _on_status(self, message: String) -> None:
+        status = decode(message.data, TeamStatus)
+        if status.robot == self._name:
+            self._status = status
+
+    def _on_placement(self, message: String) -> None:
+        placement = decode(message.data, TeamPlacement)
+        if placement.robot == self._name:
+            (other,) = {placement.first, placement.second} - {self._name}
+            self._placements[other] = placement
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self._values |= {entry.key: entry.value for entry in status.values}
+
+    def start(self) -> None:
+        """Start the node ``team``, which goes on where it was."""
+        words = ["-r", f"__ns:=/{self._name}", "-p", f"system:={self._name}", "-p", f"recovery:={self._folder}"]
+        command = [sys.executable, *node_command(TEAM.name), "--ros-args", *words]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=sys.stderr, env=os.environ | {"ROS_DOMAIN_ID": f"{_DOMAIN}"}
+        )
+
+    def end(self, number: int) -> None:
+        """End the node by a signal."""
+        if self._process is not None:
+            self._process.send_signal(number)
+            self._process.wait()
+            self._process = None
+
+    def serve(self) -> None:
+        """Follow the commands until ``end``."""
+        reported = 0.0
+        while True:
+            self._executor.spin_once(timeout_sec=_SPIN)
+            self._play_on()
+            if select.select([sys.stdin], [], [], 0.0)[0] and not self._follow(sys.stdin.readline().split()):
+                return
+            if time.monotonic() - reported > _PERIOD:
+                reported = time.monotonic()
+                print(json.dumps(self._report()), flush=True)
+
+    def _follow(self, words: Sequence[str]) -> bool:
+        """Follow a command; False for the last one, or where nobody gives any more."""
+        match words:
+            case ["start"]:
+                self.start()
+            case ["kill"]:
+                self.end(signal.SIGKILL)
+            case ["play", share]:
+                self._share = float(share)
+                self._until = int(self._share * len(self._messages))
+            case _:
+                self.end(signal.SIGINT)
+                return False
+        return True
+
+    def _play_on(self) -> None:
+        if self._played == self._until or time.monotonic() < self._next_at:
+            return
+        self._next_at = time.monotonic() + _INTERVAL
+        message = self._messages[self._played]
+        self._played += 1
+        if isinstance(message, Keyframe):
+            frame = keyframe_frame(message.sequence, 0, self._name)
+            self._publishers[KEYFRAME_SCANS].publish(scan_message(message.scan, frame))
+            self._publish(KEYFRAMES, KeyframeHeader.from_keyframe(message))
+        else:
+            self._publish(DOCUMENTS[type(message)], message)
+
+    def _publish(self, topic: str, document: object) -> None:
+        self._publishers[topic].publish(String(data=encode(document, system=self._name)))
+
+    def _report(self) -> dict[str, object]:
+        return {
+            "share": self._share if self._played == self._until else None,
+            "played": self._played,
+            "version": 0 if self._status is None else self._status.map_version,
+            "maps": {key: value for key, value in self._values.items() if key.startswith("map of ")},
+            "placements": {
+                other: [each.verdict.value, each.probability, *each.pose.tolist()]
+                for other, each in self._placements.items()
+            },
+            "sent": self._values.get("sent of the map", "0 kB"),
+        }
+
+
+def main() -> None:
+    """Run a robot until its commands end."""
+    name, world, lap, folder = sys.argv[1:]
+    _Host(name, chain_of(world, int(lap)), Path(folder)).serve()
+
+
+if __name__ == "__main__":
+    main()
