@@ -1,4 +1,4 @@
-"""The link between hosts with its faults, and how answers of two teams are compared. Hosts need root, and are not made."""
+"""The link between hosts with its faults, and how answers of teams are compared. No host is made, which needs root."""
 
 import math
 import socket
