@@ -1,7 +1,7 @@
 """Rendezvous: one robot observes another, or both were at one place; optional evidence of how their maps lie.
 
-It is a window of the second map, the keyframe before it, with one candidate in the first. An observer takes another
-robot for the one that it names with a probability of 1 - ``RELIABILITY``: then it tells nothing.
+It is a window of the second map, the keyframe before it, with one candidate in the first. With a small probability the
+robot that is observed is another one: then it tells nothing (docs/decisions/0079-rendezvous.md).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hmt_slam_ros.team.components import ComponentPair
 from hmt_slam_ros.team.placement import WindowCandidate
 from hmt_slam_ros.team.windows import Window
 
-RELIABILITY = 0.95
+_RELIABILITY = 0.95
 """Probability that the robot that is observed is the one that is named."""
 
 _AREA_SIZE = 50.0
@@ -36,7 +36,6 @@ _SINCE_KEYFRAME, _BETWEEN_KEYFRAMES = (
 
 Of x, y and theta, m and rad, squared.
 """
-
 
 _MAX_OF_PAIR = 32
 """Rendezvous with a robot that are kept: they bound the memory and the work."""
@@ -125,7 +124,7 @@ def rendezvous_window(pair: ComponentPair, rendezvous: Rendezvous) -> Rendezvous
         return None
     belief = first.belief.compose(rendezvous.pose).compose(PoseGaussian(np.zeros(3), second.belief.covariance))
     peak = 1.0 / math.sqrt((2.0 * math.pi) ** 3 * float(np.linalg.det(belief.covariance)))
-    odds = 1.0 - RELIABILITY + RELIABILITY * peak * 2.0 * math.pi * _AREA_SIZE * len(pair.known)
+    odds = 1.0 - _RELIABILITY + _RELIABILITY * peak * 2.0 * math.pi * _AREA_SIZE * len(pair.known)
     window = Window(second.area, second.belief.mean, {second.keyframe: second.pose_of_keyframe})
     return RendezvousWindow(window, first.area, belief, math.log(odds))
 
