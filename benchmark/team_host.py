@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import json
 import os
-import select
+import queue
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -121,11 +122,12 @@ class _Host:
 
     def serve(self) -> None:
         """Follow the commands until ``end``."""
-        reported = 0.0
+        commands, reported = queue.SimpleQueue[list[str]](), 0.0
+        threading.Thread(target=_read_commands, args=(commands,), daemon=True).start()
         while True:
             self._executor.spin_once(timeout_sec=_SPIN)
             self._play_on()
-            if select.select([sys.stdin], [], [], 0.0)[0] and not self._follow(sys.stdin.readline().split()):
+            if not commands.empty() and not self._follow(commands.get()):
                 return
             if time.monotonic() - reported > _PERIOD:
                 reported = time.monotonic()
@@ -174,6 +176,13 @@ class _Host:
             },
             "sent": self._values.get("sent of the map", "0 kB"),
         }
+
+
+def _read_commands(commands: queue.SimpleQueue[list[str]]) -> None:
+    """Read commands until there are no more, and then ``end``."""
+    for line in sys.stdin:
+        commands.put(line.split())
+    commands.put(["end"])
 
 
 def main() -> None:

@@ -207,6 +207,22 @@ def test_a_placement_that_is_sure_goes_on_lasting_after_the_process_ended():
     assert [each.verdict for each in placements] == [Verdict.JOINED]
 
 
+def test_a_placement_that_is_sure_joins_where_it_has_joined_the_other_robot():
+    """A robot that gets the other's map late, and stands: it would never join."""
+    run, _, placements = office_run()
+    theirs = next(each for _, each in reversed(placements) if each.robot == "ann")
+    team = Team(CONFIGURATION, replace(run.teams["bob"].state, joins={}, placements=()))
+    while team.is_searching:
+        team.search(100, may_wait=False)
+    elsewhere = replace(theirs, pose=theirs.pose + np.array([5.0, 0.0, 0.0]))
+    for placement, verdict in ((elsewhere, None), (theirs, Verdict.JOINED)):
+        team.handle(placement)
+        answers = team.search(100, may_wait=False)
+        assert [each.verdict for each in answers] == ([] if verdict is None else [verdict])
+    assert team.state.joins["ann"].is_joined
+    assert not team.is_searching
+
+
 def test_a_request_for_another_robot_or_session_is_not_answered():
     team = Team(CONFIGURATION, TeamState("ann", "s"))
     for request in (TeamRequest("zoe", "bob", "s", 0), TeamRequest("zoe", "ann", "earlier", 0)):

@@ -46,12 +46,19 @@ class JoinState:
 
 
 def next_join(
-    join: JoinState, meeting: Meeting, keyframes: int, configuration: Configuration, *, is_first: bool
+    join: JoinState,
+    meeting: Meeting,
+    keyframes: int,
+    configuration: Configuration,
+    *,
+    is_first: bool,
+    confirmed: Pose | None = None,
 ) -> JoinState:
     """How far a join is after a comparison.
 
     :param keyframes: number of keyframes of both maps.
     :param is_first: whether the first component is the robot's own.
+    :param confirmed: shape (3,), the placement that has lasted with the other robot, None without.
     """
     if join.is_joined and not _may_hold(meeting):
         return JoinState()
@@ -62,7 +69,8 @@ def next_join(
     sure = join.sure
     if sure is None or not is_same_placement(sure.pose, best.pose):
         sure = SurePlacement(keyframes, best.pose)
-    if not join.is_joined and keyframes - sure.keyframes < _CONFIRMING_KEYFRAMES:
+    is_confirmed = confirmed is not None and is_same_placement(confirmed, best.pose)
+    if not join.is_joined and not is_confirmed and keyframes - sure.keyframes < _CONFIRMING_KEYFRAMES:
         return replace(join, sure=sure)
     # Registration takes longer than the comparison, and only those who use the ground need the arcs.
     arcs = _joining_arcs(join, meeting, configuration, is_first=is_first) if configuration.team.uses_ground else ()
