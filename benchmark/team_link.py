@@ -54,7 +54,7 @@ POLICY = (
 
 
 @dataclass
-class _Robot:
+class _HostedRobot:
     """A robot on its host.
 
     :ivar share: of the chain that is to be played.
@@ -141,7 +141,7 @@ def _run_team(*, disturbed: bool) -> TeamOutcome:
         return _outcome(link, robots, begin)
 
 
-def _start_robot(name: str, before: Sequence[str], scratch: Path) -> _Robot:
+def _start_robot(name: str, before: Sequence[str], scratch: Path) -> _HostedRobot:
     world, lap = ROBOTS[name]
     process = subprocess.Popen(
         [*before, sys.executable, "-m", "benchmark.team_host", name, world, f"{lap}", str(scratch / name)],
@@ -151,12 +151,12 @@ def _start_robot(name: str, before: Sequence[str], scratch: Path) -> _Robot:
         stdout=subprocess.PIPE,
         text=True,
     )
-    robot = _Robot(name, process)
+    robot = _HostedRobot(name, process)
     threading.Thread(target=robot.read_reports, daemon=True).start()
     return robot
 
 
-def _part(link: LossyLink, robots: Sequence[_Robot]) -> None:
+def _part(link: LossyLink, robots: Sequence[_HostedRobot]) -> None:
     """Cut a robot off, kill its node and start it again, and let all drive on meanwhile."""
     begin = time.monotonic()
     link.cut_off = frozenset([1])
@@ -169,7 +169,7 @@ def _part(link: LossyLink, robots: Sequence[_Robot]) -> None:
 
 
 def _wait(
-    robots: Sequence[_Robot], condition: Callable[[], bool], timeout: float = _TIMEOUT, *, may_fail: bool = False
+    robots: Sequence[_HostedRobot], condition: Callable[[], bool], timeout: float = _TIMEOUT, *, may_fail: bool = False
 ) -> None:
     deadline = time.monotonic() + timeout
     while not condition():
@@ -183,11 +183,11 @@ def _wait(
         time.sleep(0.1)
 
 
-def _is_played(robots: Sequence[_Robot]) -> bool:
+def _is_played(robots: Sequence[_HostedRobot]) -> bool:
     return all(robot.report.get("share") == robot.share for robot in robots)
 
 
-def _missing(robots: Sequence[_Robot]) -> int:
+def _missing(robots: Sequence[_HostedRobot]) -> int:
     """Number of maps of others that a robot does not have whole."""
     return sum(
         not robot.report["maps"].get(f"map of {other.name}", "").startswith(f"version {version} of {version}, ")
@@ -198,11 +198,11 @@ def _missing(robots: Sequence[_Robot]) -> int:
     )
 
 
-def _is_calm(robots: Sequence[_Robot]) -> bool:
+def _is_calm(robots: Sequence[_HostedRobot]) -> bool:
     return time.monotonic() - max(robot.changed_at for robot in robots) > _CALM
 
 
-def _outcome(link: LossyLink, robots: Sequence[_Robot], begin: float) -> TeamOutcome:
+def _outcome(link: LossyLink, robots: Sequence[_HostedRobot], begin: float) -> TeamOutcome:
     answers = {
         f"{robot.name}, {other}": (verdict, probability, pose)
         for robot in robots

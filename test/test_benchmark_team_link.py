@@ -24,7 +24,7 @@ def hosts():
             end.close()
 
 
-def received(host, seconds=0.5):
+def frames_at(host, seconds=0.5):
     """What a host receives in some time."""
     frames, deadline = [], time.monotonic() + seconds
     while (left := deadline - time.monotonic()) > 0.0:
@@ -46,8 +46,8 @@ def test_frames_reach_all_other_hosts_in_their_order(hosts):
     link, (one, *others) = hosts
     send(one, 20)
     for other in others:
-        assert received(other) == [f"{n}".encode() for n in range(20)]
-    assert received(one) == []
+        assert frames_at(other) == [f"{n}".encode() for n in range(20)]
+    assert frames_at(one) == []
     assert link.counts == FrameCounts(40, 0)
 
 
@@ -55,7 +55,7 @@ def test_frames_are_lost_repeated_and_late(hosts):
     link, (one, other, _) = hosts
     link.faults = LinkFaults(lost=0.3, repeated=0.2, late=0.2, delay=0.02)
     send(one)
-    frames = [int(frame) for frame in received(other)]
+    frames = [int(frame) for frame in frames_at(other)]
     assert 0.2 < 1.0 - len(set(frames)) / FRAMES < 0.4
     assert 0.1 < len(frames) / len(set(frames)) - 1.0 < 0.3
     assert frames != sorted(frames)
@@ -66,8 +66,8 @@ def test_nothing_reaches_a_host_that_is_cut_off(hosts):
     link.cut_off = frozenset([1])
     send(one, 5)
     send(other, 5)
-    assert received(other) == []
-    assert len(received(third)) == 5
+    assert frames_at(other) == []
+    assert len(frames_at(third)) == 5
 
 
 def outcome(verdict="joined", x=1.0, missing=0, seconds=3.0):

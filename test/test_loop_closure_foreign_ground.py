@@ -115,7 +115,7 @@ def test_a_map_that_goes_on_in_another_session_adds_what_is_new_in_it():
     hybrid_map = own_map()
     _, numbers, kept = take_over(hybrid_map)
     on = replace(GROUND, session="2", scans=(*scans(0, 1), *scans(5, since=100)))
-    taken, again, _ = take_over(hybrid_map, on, numbers.continued(on, kept), first=4)
+    taken, again, _ = take_over(hybrid_map, on, numbers.numbers_of_session(on, kept), first=4)
     assert [(new.keyframe, new.area) for new in taken.keyframes] == [(-5, 4)]
     assert again.areas == {0: 2, 7: 4}
     # The join is that with the area of this drive.
@@ -127,14 +127,14 @@ def test_what_was_pruned_here_stays_so_in_another_session():
     _, numbers, kept = take_over(hybrid_map)
     del kept[numbers.keyframes[0]]
     on = replace(GROUND, session="2")
-    taken, _, _ = take_over(hybrid_map, on, numbers.continued(on, kept))
+    taken, _, _ = take_over(hybrid_map, on, numbers.numbers_of_session(on, kept))
     assert taken.keyframes == ()
 
 
 def test_a_map_from_scratch_has_numbers_of_its_own():
     _, numbers, kept = take_over(own_map())
     other = replace(GROUND, session="2", scans=scans(0, 1, 5, since=100))
-    own = numbers.continued(other, kept)
+    own = numbers.numbers_of_session(other, kept)
     assert (own.session, own.areas, own.keyframes) == ("2", {}, {})
 
 

@@ -30,7 +30,7 @@ def logs():
 
 
 @cache
-def driven():
+def drive():
     """The run, and {robot: (stamp, true pose) of each scan}."""
     run = TeamRun(Configuration(seed=50), logs())
     run.run()
@@ -43,7 +43,7 @@ def driven():
 
 def rendezvous(shift=0.0, robot="ann", other="bob", share=0.5):
     """One observes the other at a share of its drive; the pose is wrong by ``shift`` m."""
-    _, tracks = driven()
+    _, tracks = drive()
     (stamps, poses), (other_stamps, others) = tracks[robot], tracks[other]
     i, j = int(share * len(stamps)), int(share * len(other_stamps))
     pose = se2.between(poses[i], others[j]) + np.array([shift, 0.0, 0.0])
@@ -52,7 +52,7 @@ def rendezvous(shift=0.0, robot="ann", other="bob", share=0.5):
 
 def answer(robot, *seen):
     """What a robot finds with some rendezvous: its process is a copy."""
-    team = deepcopy(driven()[0].teams[robot])
+    team = deepcopy(drive()[0].teams[robot])
     for each in seen:
         team.handle(each)
     while team.is_searching:
@@ -63,7 +63,7 @@ def answer(robot, *seen):
 
 def error_of(meeting):
     """Distance of the best placement from the truth, m, as the observed pose has it."""
-    _, tracks = driven()
+    _, tracks = drive()
     starts = [poses[0] for _, poses in tracks.values()]
     return float(np.hypot(*se2.between(se2.between(*starts), meeting.distribution.best.pose)[:2]))
 
@@ -98,7 +98,7 @@ def test_a_rendezvous_counts_from_the_keyframe_after_it():
 
 
 def test_others_get_what_this_robot_observes_once():
-    team = deepcopy(driven()[0].teams["ann"])
+    team = deepcopy(drive()[0].teams["ann"])
     seen = rendezvous(share=0.1)
     assert team.handle(seen) == [seen]
     assert team.handle(replace(seen, stamp=seen.stamp + NANOSECONDS)) == []

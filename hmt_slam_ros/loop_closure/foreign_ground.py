@@ -31,7 +31,7 @@ class ForeignNumbers:
     keyframes: Mapping[int, int] = field(default_factory=dict)
     joining_arcs: frozenset[AreaPair] = frozenset()
 
-    def continued(self, ground: JoinedGround, scans: Mapping[int, Scan]) -> ForeignNumbers:
+    def numbers_of_session(self, ground: JoinedGround, scans: Mapping[int, Scan]) -> ForeignNumbers:
         """The numbers in another session of the map: those up to the last keyframe that is the same one in both.
 
         Nodes that start from a saved map number on from it, so that keyframes after it have the numbers of others.

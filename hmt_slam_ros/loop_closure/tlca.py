@@ -240,7 +240,7 @@ class Tlca:
         path, hybrid_map = self._state.paths[only], self._replica.maps[only]
         known = self._state.foreign_numbers.get(ground.robot, ForeignNumbers(ground.session))
         if known.session != ground.session:
-            known = known.continued(ground, self._replica.scans)
+            known = known.numbers_of_session(ground, self._replica.scans)
         largest = max(hybrid_map.max_area_id, self._closure_revision.state.max_area_id)
         next_keyframe = next_foreign_keyframe(self._state.foreign_numbers, self._replica.scans)
         taker = GroundTaker(hybrid_map, known, path.arc_keyframes.keys(), largest + 1, next_keyframe)

@@ -129,7 +129,7 @@ def rendezvous_window(pair: ComponentPair, rendezvous: Rendezvous) -> Rendezvous
     return RendezvousWindow(window, first.area, belief, math.log(odds))
 
 
-class _Place(NamedTuple):
+class _RobotPlace(NamedTuple):
     """Where a robot was in its map.
 
     :ivar area: of the keyframe.
@@ -144,7 +144,7 @@ class _Place(NamedTuple):
     pose_of_keyframe: Float64
 
 
-def _place_at(pair: ComponentPair, areas: Collection[int], stamp: int) -> _Place | None:
+def _place_at(pair: ComponentPair, areas: Collection[int], stamp: int) -> _RobotPlace | None:
     """Where the robot of a component was at a time: between two successive keyframes, None without them."""
     area_of = {k: area for area in areas for k in pair.hybrid_map.keyframes(area)}
     keyframes = sorted(area_of)
@@ -159,4 +159,4 @@ def _place_at(pair: ComponentPair, areas: Collection[int], stamp: int) -> _Place
         begin, end = pair.scans[before].stamp, pair.scans[next_one].stamp
         pose = se2.interpolate(start, pair.hybrid_map.keyframes(area)[next_one], (stamp - begin) / (end - begin))
         covariance = _BETWEEN_KEYFRAMES
-    return _Place(area, before, PoseGaussian(pose, covariance), se2.between(pose, start))
+    return _RobotPlace(area, before, PoseGaussian(pose, covariance), se2.between(pose, start))
