@@ -210,6 +210,7 @@ DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow("hmt_slam_ros.messages.tasks:PlaceEstimate", "pilot/place_estimate", "place_estimate", 2),
     DocumentRow(f"{_MESSAGES}:EarlyEstimate", "hmt/early_estimate", "early_estimate", 1),
     DocumentRow("hmt_slam_ros.messages.ambiguity:Ambiguity", "hmt/ambiguity", "ambiguity", 1),
+    DocumentRow("hmt_slam_ros.messages.topology:Topology", "hmt/topology", "topology", 1),
     DocumentRow(f"{_TEAM}:JoinedGround", "hmt/joined_ground", "joined_ground", 1),
     DocumentRow(f"{_TEAM}:TeamStatus", "/team/statuses", "team_status", 1),
     DocumentRow(f"{_TEAM}:TeamRequest", "/team/requests", "team_request", 1),

@@ -146,7 +146,7 @@ _TASK_TOPICS = ("cmd_vel", "~/task_result", "goal_pose")
 _FURTHER_PUBLISHED: dict[str, tuple[str, ...]] = {
     "slam": (*_REQUESTS, "hmt/particles"),
     "tsbi": ("hmt/pmf", "hmt/is_localized", "hmt/entropy"),
-    "tlca": ("map", "hmt/graph", "hmt/ambiguity_goal"),
+    "tlca": ("map", "hmt/graph", "hmt/path", "hmt/topology", "hmt/ambiguity_goal"),
     "rtl": ("tf",),
     "team": ("tf",),
     "robot": ("scan", "odom", "/clock", "hmt/robot_status", "tf", "tf_static", "ground_truth"),
@@ -170,14 +170,14 @@ _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
     "operator": (
         *("map", "pose", "hmt/pose", "hmt/graph", "hmt/particles", "diagnostics", "hmt/notices", "scan", "tf"),
         *("tf_static", "explorer/task_result", "pilot/task_result", "pilot/place_estimate"),
-        *("hmt/ambiguity", "hmt/ambiguity_goal"),
+        *("hmt/ambiguity", "hmt/ambiguity_goal", "hmt/path", "hmt/topology"),
     ),
 }
 """{node: topics that follow from no message of the process table}."""
 
 _SERVICES = {
     "slam": ("save", "load_map", "reset", "relocalize", "pause"),
-    "tlca": ("get_map",),
+    "tlca": ("get_map", "get_graphml"),
     "robot": ("pause",),
 }
 """{node: its services beside those of every node}."""

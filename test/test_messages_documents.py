@@ -39,6 +39,7 @@ from hmt_slam_ros.messages.messages import (
 )
 from hmt_slam_ros.messages.tasks import PlaceEstimate
 from hmt_slam_ros.messages.team import JoinedGround, TeamMessage, Verdict
+from hmt_slam_ros.messages.topology import Topology
 from hmt_slam_ros.plain_data import field_names, is_record
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import Scan
@@ -62,6 +63,7 @@ KINDS = (
     Ambiguity,
     *get_args(TeamMessage),
     JoinedGround,
+    Topology,
 )
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 SINGLES = st.floats(allow_nan=False, allow_infinity=False, width=32)

@@ -66,6 +66,8 @@ def load_in_nodes(folder: Path) -> None:
     renderer = MapRenderer(node.configuration, "map", MapRendererState.from_document(document))
     renderer.occupancy_grid()
     renderer.graph_markers()
+    renderer.path()
+    renderer.topology(processes["tlca"].robot_poses)
     Explorer(node.configuration, Replica.from_state(document.replica))
     with contextlib.suppress(HmtSlamError):  # a small map has no places
         PilotProcess(node.configuration, document.replica)

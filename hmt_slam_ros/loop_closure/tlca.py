@@ -190,6 +190,11 @@ class Tlca:
             area_frames=self._ambiguity.area_frames,
         )
 
+    @property
+    def robot_poses(self) -> Mapping[int, Float64]:
+        """{hypothesis: the robot's ``area_T_base`` at the last keyframe event, shape (3,), m and rad}."""
+        return self._state.poses
+
     def handle(self, message: Message) -> list[Message]:
         """Learn from a ``Keyframe``; answer ``Hypotheses``."""
         if isinstance(message, Keyframe):

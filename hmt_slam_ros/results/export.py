@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ from hmt_slam_ros.places.area_views import AreaViewCache
 from hmt_slam_ros.places.chart import NODE_KIND_NAMES, Chart, ChartNode, build_chart
 from hmt_slam_ros.places.observation_graph import TRACK_NAMES, LandmarkSequence
 from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, Edge
+from hmt_slam_ros.results.graphml import arc_attributes, area_attributes, graphml, pose_values
 from hmt_slam_ros.results.hmt_map import read_saved_map
 from hmt_slam_ros.results.log_reading import map_folder
 from hmt_slam_ros.submap.local_mapping import LocalMapping
@@ -33,10 +33,6 @@ _FINEST, _COARSEST = 0.005, 10.0
 
 PLACES, TOPOLOGY, LANDMARKS = "places.json", "topology.graphml", "landmarks.json"
 """Files of the chart of places, of the topology and of the landmarks."""
-
-_POSE = ("x", "y", "theta")
-_COVARIANCE = ("xx", "xy", "xt", "yy", "yt", "tt")
-"""Names of the components of a pose, and of the upper triangle of its covariance."""
 
 
 def export_grid(
@@ -154,9 +150,7 @@ def export_topology(directory: Path) -> tuple[Path, Path, Path]:
     mapping = LocalMapping(saved.configuration)
     kinds, views = AreaClassifier(mapping), AreaViewCache(mapping, saved.replica.scans).views_of_map(hybrid_map)
     landmarks = {area: view.landmarks for area, view in views.items()}
-    import networkx as nx  # noqa: PLC0415  it takes 0.2 s and 12 MB, for this command alone
-
-    graph = nx.DiGraph()
+    areas: dict[int, dict[str, object]] = {}
     if missing := sorted(set(hybrid_map.area_ids()) - saved.area_poses.keys()):
         raise HmtSlamError(f"{directory} has no pose of the areas {shorten(missing)}: map the log again")
     for area in hybrid_map.area_ids():
@@ -164,15 +158,13 @@ def export_topology(directory: Path) -> tuple[Path, Path, Path]:
         keyframes = hybrid_map.keyframes(area)
         kind = kinds.classify([saved.replica.scans[k] for k in keyframes], stack_poses(keyframes))
         hallway = {} if kind is None else {"hallway": kind.probability}
-        graph.add_node(
-            area, **_pose_values(saved.area_poses[area]), keyframes=len(keyframes), robot=has_robot, **hallway
-        )
+        areas[area] = {**area_attributes(saved.area_poses[area], len(keyframes), has_robot), **hallway}
     portals = find_portals(hybrid_map, landmarks, saved.configuration.features)
-    for a, b, arc in hybrid_map.all_arcs():
-        graph.add_edge(a, b, **_pose_values(arc.pose), closure=arc.closure, **_portal_attributes(portals, (a, b)))
-    graphml = io.BytesIO()
-    nx.write_graphml_xml(graph, graphml)
-    write_file(directory / TOPOLOGY, graphml.getvalue())
+    arcs = {
+        (a, b): {**arc_attributes(arc.pose, arc.closure), **_portal_attributes(portals, (a, b))}
+        for a, b, arc in hybrid_map.all_arcs()
+    }
+    write_file(directory / TOPOLOGY, graphml(areas, arcs))
     document = {
         "areas": {str(area): [_landmark_entry(landmark) for landmark in known] for area, known in landmarks.items()},
         "portals": [_portal_entry(portal) for portal in portals],
@@ -188,7 +180,7 @@ def _portal_attributes(portals: Sequence[Portal], areas: tuple[int, int]) -> dic
     if not between:
         return {"portals": 0}
     best = max(between, key=lambda portal: portal.existence)
-    pose = {f"portal_{name}": value for name, value in _pose_values(best.pose_in_a).items()}
+    pose = {f"portal_{name}": value for name, value in pose_values(best.pose_in_a).items()}
     return {"portals": len(between), **pose, "portal_width": best.width, "portal_existence": best.existence}
 
 
@@ -197,7 +189,7 @@ def _landmark_entry(landmark: Landmark) -> dict[str, object]:
     opening = {"width": landmark.width, "width_deviation": landmark.width_deviation} if landmark.width else {}
     return {
         "kind": KIND_NAMES[landmark.kind],
-        **_pose_values(landmark.pose),
+        **pose_values(landmark.pose),
         **opening,
         "existence": existence.probability,
         "seen": existence.detections,
@@ -208,15 +200,10 @@ def _landmark_entry(landmark: Landmark) -> dict[str, object]:
 def _portal_entry(portal: Portal) -> dict[str, object]:
     return {
         "areas": list(portal.areas),
-        "in_first": _pose_values(portal.pose_in_a),
-        "in_second": _pose_values(portal.pose_in_b),
+        "in_first": pose_values(portal.pose_in_a),
+        "in_second": pose_values(portal.pose_in_b),
         "width": portal.width,
         "width_deviation": portal.width_deviation,
         "existence": portal.existence,
         "passages": portal.crossing_count,
     }
-
-
-def _pose_values(belief: PoseGaussian) -> dict[str, float]:
-    upper = belief.covariance[np.triu_indices(3)]
-    return dict(zip(_POSE + _COVARIANCE, [*belief.mean.tolist(), *upper.tolist()], strict=True))

@@ -1,9 +1,10 @@
-"""Rendering of the map: an occupancy grid, and areas and arcs as markers."""
+"""Rendering of the map: an occupancy grid, areas and arcs as markers or as data, and the path."""
 
 from __future__ import annotations
 
 import math
 from array import array
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -18,11 +19,15 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import ELLIPSE_95, PoseGaussian
+from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
+from hmt_slam_ros.hybrid_map.surroundings import stack_poses
 from hmt_slam_ros.messages.map_changes import AreaPose
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
+from hmt_slam_ros.messages.topology import Topology
 from hmt_slam_ros.ros.conversions import header_message, quaternion_message, time_message
+from hmt_slam_ros.ros.keyframe_path import serialized_path
 
 if TYPE_CHECKING:
     from hmt_slam_ros.results.hmt_map import MapDocument
@@ -60,16 +65,16 @@ class MapRenderer:
     """Renders the most probable hypothesis from the messages of the chain.
 
     :ivar stamp: of the newest keyframe, ns.
-    :ivar version: number of changes so far.
+    :ivar events: number of keyframe events that the map has.
     """
 
-    def __init__(self, configuration: Configuration, frame: str, state: MapRendererState) -> None:
+    def __init__(self, configuration: Configuration, frame: str, state: MapRendererState, events: int = 0) -> None:
         """Start with a state.
 
         :param frame: name of the map's frame.
+        :param events: number of keyframe events before.
         """
-        self.stamp = state.stamp
-        self.version = 1 if state.area_poses else 0
+        self.stamp, self.events = state.stamp, events
         self._settings, self._frame = configuration.local_map, frame
         self._replica = Replica.from_state(state.replica)
         self._area_poses = {entry.area: entry.pose for entry in state.area_poses}
@@ -89,7 +94,7 @@ class MapRenderer:
         elif isinstance(message, ClosureDecision):
             if message.global_poses:
                 self._area_poses = {entry.area: entry.pose for entry in message.global_poses}
-            self.version += 1
+            self.events = message.sequence + 1
 
     def pose_in_map(self, area: int, pose: Float64) -> Float64 | None:
         """``map_T_base`` (3,) of a pose in an area, None where the area has no pose in the map.
@@ -119,6 +124,28 @@ class MapRenderer:
         poses = np.array(list(keyframe_poses.values()))
         image = occupancy_image(scans, poses, self._settings.cell, self._settings.max_range)
         return grid_message(self.stamp, self._frame, image)
+
+    def path(self) -> bytes:
+        """The serialized nav_msgs/Path of the robot's own keyframes, in the order of their numbers.
+
+        Without keyframes in areas whose place in the map is unknown.
+        """
+        hybrid_map = self._replica.maps[self._replica.best_hypothesis]
+        known = [area for area in self._area_ids() if not is_uninformative(self._area_poses[area])]
+        numbers = np.array([k for area in known for k in hybrid_map.keyframes(area)], dtype=np.int64)
+        blocks = [se2.compose(self._area_poses[a].mean, stack_poses(hybrid_map.keyframes(a))) for a in known]
+        own = [k for k in np.argsort(numbers).tolist() if numbers[k] > NO_KEYFRAME]
+        stamps = np.array([self._replica.scans[k].stamp for k in numbers[own].tolist()], dtype=np.int64)
+        poses = np.concatenate(blocks)[own] if blocks else np.zeros((0, 3))
+        return serialized_path(self.stamp, self._frame, stamps, poses)
+
+    def topology(self, robot_poses: Mapping[int, Float64]) -> Topology:
+        """The areas and arcs as data.
+
+        :param robot_poses: {hypothesis: ``area_T_base`` of the robot at the newest keyframe event, shape (3,)}.
+        """
+        pose = robot_poses[self._replica.best_hypothesis]
+        return Topology.from_replica(self._replica, self._area_poses, pose, self._frame, self.events, self.stamp)
 
     def graph_markers(self) -> MarkerArray:
         """Areas as labeled discs, arcs as lines, both with 95 % ellipses and texts.

@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
+from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetMap
-from rclpy.publisher import Publisher
-from std_msgs.msg import Bool, Float64, Float64MultiArray
+from std_msgs.msg import Bool, Float64, Float64MultiArray, String
+from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.messages.ambiguity import Ambiguity
+from hmt_slam_ros.messages.documents import encode
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Message, RealTimePose, TrackingReset
+from hmt_slam_ros.messages.topology import Topology
 from hmt_slam_ros.real_time_localization.rtl import CorrectionSmoother
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import (
@@ -25,17 +28,20 @@ from hmt_slam_ros.ros.conversions import (
     transform_message,
 )
 from hmt_slam_ros.ros.execution import set_realtime_priority
+from hmt_slam_ros.ros.map_publisher import MapPublisher
 from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
 from hmt_slam_ros.ros.parameters import declare_frame
 from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.recovery import CHECKPOINT
 from hmt_slam_ros.ros.topics import (
     AMBIGUITY_GOAL,
+    DOCUMENTS,
     ENTROPY,
     GRAPH,
     HMT_POSE,
     IS_LOCALIZED,
     MAP,
+    PATH,
     PMF,
     POSE,
     transform_publisher,
@@ -43,13 +49,16 @@ from hmt_slam_ros.ros.topics import (
 from hmt_slam_ros.saved_map.folder import VERSION, FolderReader
 
 if TYPE_CHECKING:
+    from hmt_slam_ros.loop_closure.tlca import Tlca
     from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 _RENDERER_STATE = "view"
 _AMBIGUITY = "ambiguity"
 """Name of the value in /diagnostics."""
-_RENDER_PERIOD = 3.0
+_CHECK_PERIOD = 1.0
 """Time between two checks whether the map has to be published again, s."""
+_DRAWING_PERIOD, _DATA_PERIOD = 2.9, 0.9
+"""Least times between two drawings of the map, and between two messages of its data, s; just below whole checks."""
 
 
 class TsbiNode(ProcessNode):
@@ -94,7 +103,9 @@ def pmf_message(hypotheses: Hypotheses) -> Float64MultiArray:
 
 
 class TlcaNode(ProcessNode):
-    """The node ``tlca``: the occupancy grid, the graph of areas and arcs, and where a look would decide."""
+    """The node ``tlca``: the map as a grid, as markers, as data and as a path, and where a look would decide."""
+
+    process: Tlca
 
     def declare_own_parameters(self) -> None:
         """As any process node; also declare ``map_frame``."""
@@ -105,22 +116,27 @@ class TlcaNode(ProcessNode):
         """As any process node; also publish the map."""
         super().configure_node()
         self._renderer = self._make_renderer(MapRendererState.from_document(self.initial_state.map))
-        self._grids = self.create_publisher(OccupancyGrid, MAP, topics.LATCHED)
-        self._graphs = self.create_publisher(MarkerArray, GRAPH, topics.LATCHED)
+        self._map_publishers = (
+            MapPublisher(self, OccupancyGrid, MAP, MapRenderer.occupancy_grid, _DRAWING_PERIOD),
+            MapPublisher(self, MarkerArray, GRAPH, MapRenderer.graph_markers, _DRAWING_PERIOD),
+            MapPublisher(self, PathMessage, PATH, MapRenderer.path, _DATA_PERIOD),
+            MapPublisher(self, String, DOCUMENTS[Topology], self._topology_document, _DATA_PERIOD),
+        )
         self._ambiguity_goals = self.create_publisher(PoseStamped, AMBIGUITY_GOAL, topics.STREAM)
-        self._published_versions = {GRAPH: 0, MAP: 0}
-        self.create_timer(_RENDER_PERIOD, self._publish_if_changed, clock=self.diagnostics.steady_clock)
+        self.create_timer(_CHECK_PERIOD, self._publish_if_changed, clock=self.diagnostics.steady_clock)
         self.create_service(GetMap, "~/get_map", self._get_map)
+        self.create_service(Trigger, "~/get_graphml", self._get_graphml)
 
     def _make_renderer(self, state: MapRendererState) -> MapRenderer:
-        return MapRenderer(self.configuration, self._map_frame, state)
+        return MapRenderer(self.configuration, self._map_frame, state, self.initial_state.events)
 
     def reset(self, folder: str, reset_number: int = 0) -> None:
         """As any process node; also publish the new map."""
         super().reset(folder, reset_number)
         self.diagnostics.values.pop(_AMBIGUITY, None)
         self._renderer = self._make_renderer(MapRendererState.from_document(self.initial_state.map))
-        self._published_versions = {GRAPH: -1, MAP: -1}
+        for publisher in self._map_publishers:
+            publisher.invalidate()
 
     def node_state(self) -> dict[str, object]:
         """State of the renderer."""
@@ -154,19 +170,22 @@ class TlcaNode(ProcessNode):
             self._ambiguity_goals.publish(PoseStamped(header=header, pose=pose_message(pose)))
 
     def _publish_if_changed(self) -> None:
-        if not self.is_active:
-            return
-        if self._is_due(GRAPH, self._graphs):
-            self._graphs.publish(self._renderer.graph_markers())
-        if self._is_due(MAP, self._grids) and (grid := self._renderer.occupancy_grid()) is not None:
-            self._grids.publish(grid)
+        if self.is_active:
+            for publisher in self._map_publishers:
+                publisher.publish_if_due(self._renderer)
 
-    def _is_due(self, topic: str, publisher: Publisher) -> bool:
-        """Whether the map has changed since its last publication, and the topic has subscribers."""
-        due = self._published_versions[topic] != self._renderer.version and publisher.get_subscription_count() > 0
-        if due:
-            self._published_versions[topic] = self._renderer.version
-        return due
+    def _topology_document(self, renderer: MapRenderer) -> String:
+        topology = renderer.topology(self.process.robot_poses)
+        return String(data=encode(topology, self.reset_number, self.diagnostics.system.name))
+
+    def _get_graphml(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Answer with the areas and arcs as GraphML."""
+        from hmt_slam_ros.results.graphml import topology_graphml  # noqa: PLC0415  networkx takes long to load
+
+        topology = self._renderer.topology(self.process.robot_poses)
+        response.success = bool(topology.areas)
+        response.message = topology_graphml(topology) if topology.areas else "nothing is mapped yet, drive first"
+        return response
 
 
 class RtlNode(ProcessNode):
