@@ -35,6 +35,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         *((f"share/{NAME}/{folder}", files_in(folder)) for folder in SHARED),
+        (f"share/{NAME}/schemas", files_in("docs/reference/schemas")),
         (f"lib/{NAME}", [f"libexec/{node}" for node in NODES]),
     ],
     install_requires=[
@@ -49,7 +50,7 @@ setup(
     ],
     extras_require={
         "docs": [*DOCS],
-        "test": ["hypothesis", "import-linter", "mypy", "pytest", "pytest-xdist", "ruff", *DOCS],
+        "test": ["hypothesis", "import-linter", "jsonschema", "mypy", "pytest", "pytest-xdist", "ruff", *DOCS],
     },
     zip_safe=False,
     entry_points={

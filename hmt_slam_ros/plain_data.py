@@ -94,7 +94,7 @@ class PlainDataReader:
             return self._object(cast(type, kind))
         if origin in (Union, types.UnionType):
             return self._union(field, arguments)
-        words = _words(kind)
+        words = literal_words(kind)
         return self._literal(words) if words else self._collection(origin, arguments)
 
     def _collection(self, origin: object, arguments: tuple[Any, ...]) -> Reader:
@@ -209,7 +209,7 @@ class PlainDataReader:
         )
 
 
-def _words(kind: Hashable) -> dict[str, object]:
+def literal_words(kind: Hashable) -> dict[str, object]:
     """{word in a document: value} of a literal or an enumeration, empty for other types."""
     if isinstance(kind, type) and issubclass(kind, StrEnum):
         return {member.value: member for member in kind}

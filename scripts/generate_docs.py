@@ -4,15 +4,27 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from string import Template
 
 from hmt_slam_ros.configuration import Configuration, flat_parameters
 from hmt_slam_ros.configuration.documents import parameter_reference, parameter_table, ros_yaml
-from hmt_slam_ros.process_table import COORDINATOR, DOCUMENTS, RECORDER, TEAM, NodeRow, ProcessRow, node_rows
+from hmt_slam_ros.messages.schemas import document_schema
+from hmt_slam_ros.process_table import (
+    COORDINATOR,
+    DOCUMENTS,
+    RECORDER,
+    TEAM,
+    DocumentRow,
+    NodeRow,
+    ProcessRow,
+    node_rows,
+)
 from hmt_slam_ros.results.hmt_map import PARTS, ChainState, MapDocument
 from hmt_slam_ros.results.log_reading import FIXED_PARAMETERS
 from hmt_slam_ros.saved_map.folder import FORMAT, SCANS, VERSION
@@ -267,13 +279,19 @@ def _rules(kind: str, qualifier: str, names: Iterable[str]) -> list[str]:
     return [f'          <{kind}s {qualifier}="ALLOW">', *listed, f"          </{kind}s>"] if listed else []
 
 
-GENERATED = {
+def _schema(row: DocumentRow, _configuration: Configuration) -> str:
+    """docs/reference/schemas/DOCUMENT.schema.json: the JSON schema of a document."""
+    return json.dumps(document_schema(row), indent=1) + "\n"
+
+
+GENERATED: dict[str, Callable[[Configuration], str]] = {
     "config/hmt_slam.yaml": ros_yaml,
     "config/sros2_policy.xml": sros2_policy,
     "docs/reference/constants.md": constants,
     "docs/reference/map_format.md": map_format,
     "docs/reference/parameters.md": parameter_reference,
     "docs/guides/simulation_settings.md": simulation_settings,
+    **{f"docs/reference/schemas/{row.document}.schema.json": partial(_schema, row) for row in DOCUMENTS},
 }
 
 

@@ -243,11 +243,18 @@ def _read_ranges(content: object, path: str) -> object:
         raise _VALUES.error_at(path, content, "the bytes of float32 numbers in base64") from None
 
 
-def _array_reader(field: str, kind: Hashable) -> Reader:  # noqa: ARG001  all arrays have one type
-    """The reader of an array, by its name: ranges, a second moment, shape (3, 3), or else a pose, shape (3,)."""
+def array_shape(field: str) -> tuple[int, ...] | None:
+    """The shape of the array in a field, by its name: a second moment, or else a pose; None for float32 numbers."""
     if field in ("ranges", "starts"):
+        return None
+    return (3, 3) if field in ("covariance", "ambiguity") else (3,)
+
+
+def _array_reader(field: str, kind: Hashable) -> Reader:  # noqa: ARG001  all arrays have one type
+    """The reader of an array."""
+    shape = array_shape(field)
+    if shape is None:
         return _read_ranges
-    shape = (3, 3) if field in ("covariance", "ambiguity") else (3,)
     wanted = f"an array of finite numbers of shape {shape}"
 
     def read(content: object, path: str) -> object:

@@ -125,7 +125,8 @@ class TeamPlacement:
     """team -> other programs: how the map of one robot lies in that of another, where that has changed.
 
     :ivar robot: name of the robot that says so.
-    :ivar first: name of the robot in whose map the other's lies, ``second``.
+    :ivar first: name of the robot in whose map the other's lies.
+    :ivar second: name of that other robot, after ``first`` in the order of names.
     :ivar verdict: joined; apart, as all placements together are less probable; open, as none is sure; or
         contradictory, as the arcs of a sure placement contradict one another.
     :ivar probability: of the most probable placement, 0 where there is none.

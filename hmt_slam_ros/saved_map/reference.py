@@ -55,12 +55,19 @@ def _nested_records(kind: type) -> Iterator[type]:
 
 
 def _section_lines(kind: type, title: str, names: Mapping[type, str]) -> list[str]:
-    text = inspect.getdoc(kind) or ""
-    meanings = {name: _plain_text(meaning) for name, meaning in _IVAR.findall(text)}
-    hints = get_type_hints(kind)
+    meanings, hints = field_meanings(kind), get_type_hints(kind)
     rows = [f"| `{name}` | {_type_text(hints[name], names)} | {meanings.get(name, '')} |" for name in field_names(kind)]
-    summary = _plain_text(text.split(":ivar", 1)[0].split("\n\n", 1)[0])
-    return [f"### {title}", "", summary, "", "| field | type | meaning |", "|---|---|---|", *rows, ""]
+    return [f"### {title}", "", summary(kind), "", "| field | type | meaning |", "|---|---|---|", *rows, ""]
+
+
+def summary(kind: type) -> str:
+    """The first paragraph of the docstring of a class, without markup of roles."""
+    return _plain_text((inspect.getdoc(kind) or "").split(":ivar", 1)[0].split("\n\n", 1)[0])
+
+
+def field_meanings(kind: type) -> dict[str, str]:
+    """{field: meaning} of a class, from its docstring."""
+    return {name: _plain_text(meaning) for name, meaning in _IVAR.findall(inspect.getdoc(kind) or "")}
 
 
 def _plain_text(text: str) -> str:
