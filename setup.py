@@ -14,7 +14,7 @@ NAME = "hmt_slam_ros"
 TABLE = run_path(f"{NAME}/process_table.py")
 NODES = TABLE["program_names"]()
 DOCS = ("myst-parser>=4.0", "sphinx>=8.1", "sphinx-autoapi>=3.4")
-SHARED = ("launch", "config", "data/malaga_one_loop")
+SHARED = ("launch", "config", "examples", "data/malaga_one_loop")
 
 
 def files_in(folder: str) -> list[str]:

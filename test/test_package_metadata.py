@@ -109,6 +109,7 @@ def test_the_installed_files_exist_and_hold_marker_launch_configuration_and_the_
         f"{share}/config/hmt_slam.yaml",
         f"{share}/config/hmt_slam.rviz",
         f"{share}/config/foxglove_layout.json",
+        f"{share}/examples/graph_consumer.cpp",
         f"{share}/schemas/topology.schema.json",
         f"{share}/data/malaga_one_loop/metadata.yaml",
         f"{share}/data/malaga_one_loop/README.md",
