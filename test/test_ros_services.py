@@ -29,7 +29,8 @@ NAMED = {value for name, value in vars(topics).items() if name.isupper() and isi
 MESSAGES = Path(__file__).parent.parent / "docs" / "reference" / "messages.md"
 SAID = {f"/{topic.lstrip('/')}" for topic in {*NAMED, *topics.DOCUMENTS.values(), *TRANSFORMS}} - {
     *("/team/statuses", "/team/requests", "/team/updates", "/team/placements", "/hmt/joined_ground"),  # of a team
-    *("/initialpose", "/cmd_vel"),  # which are subscribed to
+    "/team/rendezvous",  # likewise
+    *("/initialpose", "/cmd_vel", "/rendezvous"),  # which are subscribed to
     "/ground_truth",  # of a robot that is driven
     *("/goal_pose", "/pilot/place_estimate"),  # of explorer and pilot
     "/hmt/notices",  # as there is nothing to complain of
