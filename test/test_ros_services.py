@@ -18,11 +18,12 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.messages.documents import KeyframeHeader, decode
+from hmt_slam_ros.messages.documents import KeyframeHeader, decode, decode_with_reset
 from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.messages.topology import Topology
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.topics import KEYFRAMES, MAP, TFMessage
+from hmt_slam_ros.ros.topics import DOCUMENTS, KEYFRAMES, MAP, TFMessage
 
 TRANSFORMS = {"tf", "tf_static"} if TFMessage else set()
 NAMED = {value for name, value in vars(topics).items() if name.isupper() and isinstance(value, str)}
@@ -88,8 +89,16 @@ def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_messages_can_
     nodes = Nodes(start, listener, start_from=out, start_lost=False, save_to=tmp_path / "saved")
     keyframes = listener.subscribe(String, KEYFRAMES, topics.CHAIN)
     nodes.until(lambda: {m.status[0].name for m in nodes.diagnostics} == {f"/{name}" for name in NODES})
+    topologies = listener.subscribe(String, DOCUMENTS[Topology], topics.LATCHED)
+    nodes.until(lambda: topologies)
+    before, reset_number = decode_with_reset(topologies[-1].data, Topology)
+    assert before.areas
+    assert (before.events > 0, reset_number) == (True, 0)
     answer = listener.call(Trigger, "slam/reset", Trigger.Request())
     assert (answer.success, answer.message) == (True, "the map is forgotten, a new one begins")
+    nodes.until(lambda: decode(topologies[-1].data, Topology).events == 0)
+    after, reset_number = decode_with_reset(topologies[-1].data, Topology)
+    assert (after.areas, reset_number > 0) == ((), True)
     assert listener.call(GetMap, "tlca/get_map", GetMap.Request()).map.info.width == 0
     # Slam, rtl, and the recording.
     nodes.drive(log, first=40, rate=8.0, robot__duration=8.0, robot__odometry_listeners=3)
