@@ -62,6 +62,7 @@ MEASUREMENTS = {
     "merge": "maps of halves of a drive that are made apart and joined",
     "team": "robots that map at once from unknown starts: joins, right or wrong, and the path until then",
     "team_exploration": "exploration of an institute by two robots, and by one",
+    "team_scale": "cost of the process team in maps of up to 1,000 areas",
     "team_link": "robots on hosts of their own, whose link loses, repeats and reorders frames, and breaks",
     "laps": "memory, cost and errors over repeated laps on known ground",
     "changes": "maps of changing worlds in mode lifelong, among people",

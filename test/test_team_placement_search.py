@@ -60,6 +60,29 @@ def test_maps_that_grow_end_as_if_they_had_been_compared_whole():
     assert one.distribution.best.probability == pytest.approx(other.distribution.best.probability, rel=1e-9)
 
 
+def test_a_window_is_searched_in_a_bounded_number_of_areas(monkeypatch):
+    """Those that look most like it; the others count as not searched, and come when the maps have grown."""
+    whole, (all_steps,) = search_parts((1.0, 1.0))
+    monkeypatch.setattr("hmt_slam_ros.team.placement_search._FIRST_REGIONS", 1)
+    monkeypatch.setattr("hmt_slam_ros.team.placement_search._REGIONS", 1)
+    search, (first_steps, *_) = search_parts((1.0, 1.0))
+    assert first_steps < all_steps
+    assert not any(each.search.unexamined for each in whole._searches.values())
+    assert any(each.search.unexamined for each in search._searches.values())
+    # Each growth goes on with the next one.
+    for share in (0.9, 1.0, 0.9, 1.0):
+        search.update(combine(part(lap(0), share), lap(1), SHIFT))
+        finish(search)
+    assert not any(each.search.unexamined for each in search._searches.values())
+
+
+def test_the_newest_windows_may_be_left_out():
+    search, _ = search_parts((1.0, 1.0))
+    whole, before = search.distribution(), search.distribution(left_out=1)
+    assert before.best.probability < whole.best.probability
+    assert max(before.best.matches) == len(search.windows) - 2
+
+
 def test_what_was_searched_is_not_searched_twice():
     _, whole = search_parts((1.0, 1.0))
     _, twice = search_parts((1.0, 1.0), (1.0, 1.0))

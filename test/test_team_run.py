@@ -16,7 +16,6 @@ from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.registration.consistency import NO_CLUTTER
 from hmt_slam_ros.team import shared_map
 from hmt_slam_ros.team import team as team_module
-from hmt_slam_ros.team.lasting_join import JoinState, SurePlacement
 from hmt_slam_ros.team.team import MAX_ROBOTS, Team, TeamState
 
 CONFIGURATION = Configuration(seed=50)
@@ -193,34 +192,18 @@ def test_a_robot_whose_process_ended_stays_joined():
     assert again.state.joins["ann"].is_joined
 
 
-def test_a_placement_that_is_sure_goes_on_lasting_after_the_process_ended():
+def test_a_placement_joins_when_it_was_sure_before_the_newest_window(monkeypatch):
+    """Also where the whole map of the other robot comes late, and no keyframe is added after it."""
     team = Team(CONFIGURATION, replace(office_run()[0].teams["bob"].state, joins={}, placements=()))
     while team.is_searching:
         placements = team.search(100, may_wait=False)
-    assert [each.verdict for each in placements] == [Verdict.OPEN]
-    sure = team.state.joins["ann"].sure
-    assert sure is not None and not team.state.joins["ann"].is_joined
-    earlier = {"ann": JoinState(SurePlacement(sure.keyframes - 20, sure.pose))}
-    team = Team(CONFIGURATION, replace(team.state, joins=earlier, placements=()))
+    assert [each.verdict for each in placements] == [Verdict.JOINED]
+    monkeypatch.setattr(team_module, "was_sure", lambda *_: False)
+    team = Team(CONFIGURATION, replace(team.state, joins={}, placements=()))
     while team.is_searching:
         placements = team.search(100, may_wait=False)
-    assert [each.verdict for each in placements] == [Verdict.JOINED]
-
-
-def test_a_placement_that_is_sure_joins_where_it_has_joined_the_other_robot():
-    """A robot that gets the other's map late, and stands: it would never join."""
-    run, _, placements = office_run()
-    theirs = next(each for _, each in reversed(placements) if each.robot == "ann")
-    team = Team(CONFIGURATION, replace(run.teams["bob"].state, joins={}, placements=()))
-    while team.is_searching:
-        team.search(100, may_wait=False)
-    elsewhere = replace(theirs, pose=theirs.pose + np.array([5.0, 0.0, 0.0]))
-    for placement, verdict in ((elsewhere, None), (theirs, Verdict.JOINED)):
-        team.handle(placement)
-        answers = team.search(100, may_wait=False)
-        assert [each.verdict for each in answers] == ([] if verdict is None else [verdict])
-    assert team.state.joins["ann"].is_joined
-    assert not team.is_searching
+    assert [each.verdict for each in placements] == [Verdict.OPEN]
+    assert not team.state.joins["ann"].is_joined
 
 
 def test_a_request_for_another_robot_or_session_is_not_answered():

@@ -30,6 +30,9 @@ from hmt_slam_ros.topological_inference.place_recognition import MIN_LOG_RATIO
 _MAX_SIGMA = 2.0
 """Largest deviation of a window that is compared, m: farther away it may be anywhere."""
 
+_MAX_DRIFT = 10.0
+"""By how much arcs of the first component may disagree on where a place is, m."""
+
 _MATCH_COVARIANCE = np.diag([0.25, 0.25, np.radians(4.0)]) ** 2
 """Covariance within which a window is matched where its arcs are certain, m and rad, squared."""
 
@@ -52,6 +55,9 @@ class PlaceComparison:
         self._settings = replace(MatchSettings.from_options(options), min_log_ratio=MIN_LOG_RATIO)
         self._radius = options.place_radius
         self._outlier_rate = pair.clutter.beam_outlier_rate
+        known = [(geometry.map_pose(area, np.zeros(3))[:2], _extent(pair, area)) for area in pair.known]
+        self._centers = np.array([center for center, _ in known])
+        self._extents = np.array([extent for _, extent in known])
 
     def log_ratio(self, window: int, area: int, belief: PoseGaussian, is_matched: bool) -> float | None:
         """Log Bayes factor of the contradictions of a window, nats, at most 0; None where it lies in no place.
@@ -83,13 +89,24 @@ class PlaceComparison:
         """The area whose keyframes are nearest to a window, None beyond the radius of a place, and the belief in it."""
         positions = se2.compose(belief.mean, stack_poses(poses))[:, :2]
         distances = {
-            other: min_distance(positions, keyframe_positions(self._pair.hybrid_map, other, path.mean))
-            for other, path in self._geometry.paths(area).items()
+            other: min_distance(
+                positions,
+                keyframe_positions(self._pair.hybrid_map, other, self._geometry.paths(area)[other].mean),
+            )
+            for other in self._areas_around(area, belief, positions)
         }
-        nearest = min(distances, key=lambda other: (distances[other], other))
-        if distances[nearest] > self._radius:
+        nearest = min(distances, key=lambda other: (distances[other], other), default=None)
+        if nearest is None or distances[nearest] > self._radius:
             return None, belief
         return nearest, self._geometry.paths(nearest)[area].compose(belief)
+
+    def _areas_around(self, area: int, belief: PoseGaussian, positions: Float64) -> list[int]:
+        """The areas of the first component that may have a keyframe near some positions in an area, shape (n, 2)."""
+        extent = float(np.hypot(*(positions - belief.mean[:2]).T).max())
+        center = self._geometry.map_pose(area, belief.mean)[:2]
+        distances = np.hypot(*(self._centers - center).T)
+        near = distances <= self._extents + extent + self._radius + _MAX_DRIFT
+        return [self._pair.known[n] for n in np.flatnonzero(near)]
 
     def _match(self, query: AreaGrid, place: AreaPlace, belief: PoseGaussian) -> Float64:
         """The best pose of a window within a belief; its mean where nothing fits."""
@@ -101,3 +118,8 @@ class PlaceComparison:
         """Log Bayes factor of the place's surfaces in what the window saw, nats."""
         agreement = query.compare(place.grid.points, se2.inverse(pose))
         return MAP_IN_MAP.log_likelihood_ratio(agreement, self._outlier_rate)
+
+
+def _extent(pair: ComponentPair, area: int) -> float:
+    """Largest distance of a keyframe from the origin of its area, m."""
+    return float(np.hypot(*keyframe_positions(pair.hybrid_map, area).T).max())

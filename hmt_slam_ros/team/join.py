@@ -17,7 +17,7 @@ from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.loop_closure.closure_refinement import ClosureRefinement
 from hmt_slam_ros.messages.team import Verdict
 from hmt_slam_ros.team.components import Component, ComponentPair, combine
-from hmt_slam_ros.team.placement import Placement, PlacementDistribution
+from hmt_slam_ros.team.placement import Placement, PlacementDistribution, is_same_placement
 from hmt_slam_ros.team.placement_search import PlacementSearch
 from hmt_slam_ros.team.windows import Window
 
@@ -68,6 +68,20 @@ def judge(search: PlacementSearch, configuration: Configuration) -> Meeting:
     return Meeting(pair, windows, distribution, verdict, joined)
 
 
+def was_sure(search: PlacementSearch, meeting: Meeting, configuration: Configuration) -> bool:
+    """Whether the placement that joins two components was sure before the newest window of the second, too."""
+    if meeting.verdict is not Verdict.JOINED:
+        return False
+    before, now = search.distribution(left_out=1).best, meeting.distribution.best
+    if before is None or now is None or not is_same_placement(before.pose, now.pose):
+        return False
+    return _is_sure(before, configuration.tlca)
+
+
+def _is_sure(placement: Placement, options: LoopClosureParameters) -> bool:
+    return placement.probability >= options.accept_probability and len(placement.matches) >= MIN_WINDOWS
+
+
 def decide(
     pair: ComponentPair, windows: Sequence[Window], distribution: PlacementDistribution, configuration: Configuration
 ) -> tuple[Verdict, HybridMap | None]:
@@ -75,7 +89,7 @@ def decide(
     best, options = distribution.best, configuration.tlca
     if best is None or distribution.apart >= 0.5:
         return Verdict.APART, None
-    if best.probability < options.accept_probability or len(best.matches) < MIN_WINDOWS:
+    if not _is_sure(best, options):
         return Verdict.OPEN, None
     joined = join_at(pair, windows, best, options)
     if _is_contradictory(pair, joined, options):

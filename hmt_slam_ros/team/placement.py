@@ -46,8 +46,14 @@ _GATE = chi_square_gate(0.999)
 _SAME_PLACE = np.diag([1.0, 1.0, math.radians(15.0)]) ** 2 / _GATE
 """Covariance that the gate has with certain arcs: 1 m and 15 degrees are within it."""
 
-_MAX_PLACEMENTS = 32
-"""Most placements that are weighed: the others have less evidence at their best window."""
+_MAX_PLACEMENTS, _MAX_WINDOWS = 32, 33
+"""Most placements that are weighed: the others have less evidence at their best window. Most windows of each.
+
+They are the nearest in time: 130 m of path before the best one, and as much after it.
+"""
+
+_REACH, _REACH_SIGMAS = 10.0, 4.0
+"""Distance in the first component, m and deviations, beyond which a candidate does not agree with a belief."""
 
 _MIN_UNMAPPED = 1e-12
 """Smallest probability of unmapped ground, for logarithms."""
@@ -128,12 +134,20 @@ class PlacementGeometry:
         """:param hybrid_map: of both components, between which no informative arc is."""
         self._hybrid_map, self._windows = hybrid_map, windows
         self._paths: dict[int, dict[int, PoseGaussian]] = {}
+        self._origins: dict[int, int] = {}
 
     def paths(self, area: int) -> dict[int, PoseGaussian]:
         """{other: belief over ``area_T_other``} of the areas of the same component."""
         if area not in self._paths:
             self._paths[area] = connected_areas(self._hybrid_map, area)
         return self._paths[area]
+
+    def map_pose(self, area: int, pose: Pose) -> Pose:
+        """A pose in an area in the frame of its component, by the arcs alone, shape (3,)."""
+        if area not in self._origins:
+            origin = min(self.paths(area))
+            self._origins |= dict.fromkeys(self.paths(area), origin)
+        return se2.compose(self.paths(self._origins[area])[area].mean, pose)
 
     def predict(self, window: int, matches: Mapping[int, WindowCandidate]) -> tuple[int, PoseGaussian] | None:
         """An area of the first component, and the belief over ``area_T_reference`` of a window.
@@ -193,11 +207,13 @@ class _Growth:
 
     :ivar matches: {window: candidate} of those that agree.
     :ivar log_ratios: {window: log Bayes factor} of those that have a candidate there.
+    :ivar windows: those that may agree, ascending.
     :ivar covered: candidates that imply the same placement, as (window, number).
     """
 
     matches: dict[int, WindowCandidate]
     log_ratios: dict[int, float]
+    windows: Sequence[int]
     covered: set[tuple[int, int]] = field(default_factory=set)
 
 
@@ -218,7 +234,7 @@ def placement_distribution(
     """
     possible = max(1, known_areas * len(candidates))
     grown = _grow_placements(geometry, candidates, min(possible, _MAX_PLACEMENTS))
-    windows = [_window_evidence(geometry, each, len(candidates), compare) for each in grown]
+    windows = [_window_evidence(geometry, each, compare) for each in grown]
     placements = []
     for n, (each, own) in enumerate(zip(grown, windows, strict=True)):
         matches = {w: each.matches[w] for w in sorted(each.matches, key=lambda w: (-own[w].log_ratio, w))}
@@ -250,6 +266,7 @@ def _grow_placements(
     """
     seeds = [(w, n) for w, own in enumerate(candidates) for n in range(len(own))]
     seeds.sort(key=lambda seed: -candidates[seed[0]][seed[1]].log_ratio)
+    spots = [_Spots.of_candidates(geometry, own) for own in candidates]
     grown: list[_Growth] = []
     covered: set[tuple[int, int]] = set()
     for seed in seeds:
@@ -257,32 +274,66 @@ def _grow_placements(
             break
         if seed in covered:
             continue
-        growth = _grow(geometry, candidates, seed)
+        growth = _grow(geometry, candidates, spots, seed)
         if not growth.covered & covered:
             grown.append(growth)
         covered |= growth.covered
     return grown
 
 
+class _Spots(NamedTuple):
+    """Where the n candidates of a window are.
+
+    :ivar positions: shape (n, 2), in the frame of the first component, m.
+    :ivar reaches: shape (n,), distance within which a certain pose may agree, m.
+    """
+
+    positions: Float64
+    reaches: Float64
+
+    @classmethod
+    def of_candidates(cls, geometry: PlacementGeometry, candidates: Sequence[WindowCandidate]) -> _Spots:
+        positions = [geometry.map_pose(c.area, c.belief.mean)[:2] for c in candidates]
+        reaches = [_REACH + _REACH_SIGMAS * _deviation(c.belief) for c in candidates]
+        return cls(np.reshape(positions, (-1, 2)), np.array(reaches))
+
+    def near(self, pose: Pose, deviation: float) -> list[int]:
+        """Numbers of the candidates that may agree with a belief, from its mean, shape (3,), and deviation, m."""
+        distances = np.hypot(*(self.positions - pose[:2]).T)
+        return np.flatnonzero(distances <= self.reaches + _REACH_SIGMAS * deviation).tolist()
+
+
+def _deviation(belief: PoseGaussian) -> float:
+    """Deviation of a position, both axes together, m."""
+    return math.sqrt(float(np.trace(belief.covariance[:2, :2])))
+
+
 def _grow(
     geometry: PlacementGeometry,
     candidates: Sequence[Sequence[WindowCandidate]],
+    spots: Sequence[_Spots],
     seed: tuple[int, int],
 ) -> _Growth:
     """The placement that a candidate implies, with the windows that agree, from the nearest in time on."""
     first = candidates[seed[0]][seed[1]]
-    grown = _Growth({seed[0]: first}, {seed[0]: first.log_ratio})
-    for window in sorted(range(len(candidates)), key=lambda w: (abs(w - seed[0]), w)):
+    nearest = sorted(range(len(candidates)), key=lambda w: (abs(w - seed[0]), w))[:_MAX_WINDOWS]
+    grown = _Growth({seed[0]: first}, {seed[0]: first.log_ratio}, sorted(nearest))
+    for window in nearest:
         predicted = geometry.predict(window, grown.matches)
         if predicted is None:
             continue
-        log_shares = [geometry.log_share(candidate, *predicted) for candidate in candidates[window]]
-        agreeing = [n for n, log_share in enumerate(log_shares) if log_share is not None]
-        if not agreeing:
+        area, belief = predicted
+        near = spots[window].near(geometry.map_pose(area, belief.mean), _deviation(belief))
+        log_shares = {n: geometry.log_share(candidates[window][n], area, belief) for n in near}
+        log_ratios = {
+            n: _log_mixture(log_share, candidates[window][n].log_ratio)
+            for n, log_share in log_shares.items()
+            if log_share is not None
+        }
+        if not log_ratios:
             continue
-        log_ratios = {n: _log_mixture(log_shares[n] or 0.0, candidates[window][n].log_ratio) for n in agreeing}
-        best = max(agreeing, key=lambda n: log_ratios[n])
-        grown.covered |= {(window, n) for n in agreeing}
+        best = max(log_ratios, key=lambda n: log_ratios[n])
+        grown.covered |= {(window, n) for n in log_ratios}
         if window != seed[0]:
             grown.log_ratios[window] = log_ratios[best]
             if log_ratios[best] > 0.0:
@@ -295,12 +346,10 @@ def _log_mixture(log_share: float, log_ratio: float) -> float:
     return float(np.log1p(math.exp(log_share) * math.expm1(log_ratio)))
 
 
-def _window_evidence(
-    geometry: PlacementGeometry, grown: _Growth, windows: int, compare: Comparison
-) -> dict[int, WindowEvidence]:
+def _window_evidence(geometry: PlacementGeometry, grown: _Growth, compare: Comparison) -> dict[int, WindowEvidence]:
     """{window: its evidence} under a placement, contradictions included."""
     evidence = {}
-    for window in range(windows):
+    for window in grown.windows:
         match, own = grown.matches.get(window), grown.log_ratios.get(window, 0.0)
         if match is not None:
             own += compare(window, match.area, match.belief, True) or 0.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.sensors import Scan
@@ -25,17 +25,26 @@ from hmt_slam_ros.topological_inference.map_search import MapSearch
 Keyframes = tuple[int, ...]
 
 
+_FIRST_REGIONS, _REGIONS = 64, 16
+"""Most areas in which a window is searched: at first, and each time the first component has grown.
+
+They are those that look most like it. The others count as not searched.
+"""
+
+
 @dataclass(frozen=True, eq=False)
 class _WindowSearch:
     """The search of a window.
 
-    :ivar search: of its keyframes in the first component.
-    :ivar known: {area: its keyframes} when it was searched, or is being.
+    :ivar search: of its keyframes in the first component, None before it began.
+    :ivar known: {area: its keyframes} when it began or went on.
+    :ivar left: number of areas that are not to be searched.
     :ivar is_checked: whether the walls of the candidates were checked.
     """
 
-    search: GlobalSearch
-    known: Mapping[int, Keyframes]
+    search: GlobalSearch | None = None
+    known: Mapping[int, Keyframes] = field(default_factory=dict)
+    left: int = 0
     is_checked: bool = False
 
 
@@ -51,6 +60,8 @@ class PlacementSearch:
         self._windows: list[Window] = []
         self._in_order: list[Window | RendezvousWindow] = []
         self._searches: dict[Keyframes, _WindowSearch] = {}
+        self._outdated: dict[Keyframes, Window] = {}
+        self._known: dict[int, Keyframes] = {}
 
     @property
     def pair(self) -> ComponentPair:
@@ -74,21 +85,18 @@ class PlacementSearch:
         met = [window for each in rendezvous if (window := rendezvous_window(pair, each)) is not None]
         self._in_order = sorted([*self._windows, *met], key=_first_keyframe)
         known = {area: tuple(pair.hybrid_map.keyframes(area)) for area in pair.known}
-        earlier = self._searches
-        self._searches = {
-            key: self._continue_search(pair, window, known, earlier.get(key))
-            for key, window in ((tuple(window.poses), window) for window in self._windows)
-        }
+        # The same object where nothing has changed.
+        self._known = self._known if known == self._known else known
+        earlier, windows = self._searches, {tuple(window.poses): window for window in self._windows}
+        self._searches = {key: earlier.get(key, _WindowSearch()) for key in windows}
+        self._outdated = {key: w for key, w in windows.items() if self._searches[key].known is not self._known}
 
-    def _continue_search(
-        self, pair: ComponentPair, window: Window, known: Mapping[int, Keyframes], earlier: _WindowSearch | None
-    ) -> _WindowSearch:
+    def _continue_search(self, window: Window, earlier: _WindowSearch) -> _WindowSearch:
         """The search of a window with the areas that are new or have other keyframes still to be searched."""
-        if earlier is not None and earlier.known == known:
-            return earlier
+        pair, known = self.pair, self._known
         search = self._map_search.begin(pair.hybrid_map, window.poses, pair.first_keyframe)
-        if earlier is None:
-            return _WindowSearch(search, known)
+        if earlier.search is None:
+            return _WindowSearch(search, known, max(0, len(search.unexamined) - _FIRST_REGIONS))
         examined = {
             area
             for area, keyframes in known.items()
@@ -96,16 +104,19 @@ class PlacementSearch:
         }
         unexamined = {area: p for area, p in search.unexamined.items() if area not in examined}
         candidates = tuple(candidate for candidate in earlier.search.candidates if candidate.area in examined)
-        return _WindowSearch(replace(search, unexamined=unexamined, candidates=candidates), known)
+        search = replace(search, unexamined=unexamined, candidates=candidates)
+        return _WindowSearch(search, known, max(0, len(unexamined) - _REGIONS))
 
     def step(self) -> bool:
         """Take the next step, of the work of an event; whether there was one."""
         hybrid_map = self.pair.hybrid_map
-        for key, own in self._searches.items():
-            if own.is_checked:
+        for key, earlier in self._searches.items():
+            window = self._outdated.pop(key, None)
+            own = earlier if window is None else self._continue_search(window, earlier)
+            if own.is_checked or own.search is None:
                 continue
             self._work.begin_event()
-            if own.search.unexamined:
+            if len(own.search.unexamined) > own.left:
                 self._searches[key] = replace(own, search=self._map_search.continue_search(hybrid_map, own.search))
             else:
                 search, is_checked = self._map_search.check_candidates(hybrid_map, own.search, self.pair.clutter)
@@ -113,11 +124,14 @@ class PlacementSearch:
             return True
         return False
 
-    def distribution(self) -> PlacementDistribution:
-        """The PMF over placements, as far as it was searched."""
-        pair, windows = self.pair, self.windows
+    def distribution(self, left_out: int = 0) -> PlacementDistribution:
+        """The PMF over placements, as far as it was searched.
+
+        :param left_out: number of the newest windows that do not count.
+        """
+        pair, windows = self.pair, self.windows[: len(self._in_order) - left_out]
         known = len(pair.known)
-        candidates = [self._candidates(number, each) for number, each in enumerate(self._in_order)]
+        candidates = [self._candidates(number, each) for number, each in enumerate(self._in_order[: len(windows)])]
         geometry = PlacementGeometry(pair.hybrid_map, windows)
         comparison = PlaceComparison(pair, windows, geometry, self._configuration, self._map_search.grid_cache)
         return placement_distribution(geometry, candidates, pair.joint, known, comparison.log_ratio)
@@ -126,6 +140,8 @@ class PlacementSearch:
         if isinstance(window, RendezvousWindow):
             return [window.candidate(number)]
         pair, search = self.pair, self._searches[tuple(window.poses)].search
+        if search is None:
+            return []
         found = self._map_search.localize(pair.hybrid_map, search, pair.clutter)
         return window_candidates(number, found, len(pair.known))
 

@@ -22,8 +22,8 @@ from hmt_slam_ros.messages.team import (
     Verdict,
 )
 from hmt_slam_ros.team.components import Shift, combine
-from hmt_slam_ros.team.join import Meeting, judge
-from hmt_slam_ros.team.lasting_join import JoinState, next_join
+from hmt_slam_ros.team.join import Meeting, judge, was_sure
+from hmt_slam_ros.team.join_state import JoinState, next_join
 from hmt_slam_ros.team.placement_search import PlacementSearch
 from hmt_slam_ros.team.rendezvous import KnownRendezvous
 from hmt_slam_ros.team.shared_map import ForeignMap, ForeignMapState, SharedMap, SharedMapState
@@ -265,10 +265,6 @@ class Team:
         if names <= {self._robot, *self._others}:
             self._placements[placement.robot, placement.first, placement.second] = placement
             self.map_poses = team_poses(self._robot, self._placements.values())
-            pair = self._pairs.get(placement.robot) if self._robot in names else None
-            if pair is not None and pair.meeting is not None and placement.verdict is Verdict.JOINED:
-                # What has lasted with the other robot need not last once more.
-                pair.is_judged = pair.is_judged and pair.join.is_joined
 
     def _on_rendezvous(self, rendezvous: TeamRendezvous) -> list[Message]:
         """Keep a rendezvous for the next comparison; the others get what this robot observed."""
@@ -322,12 +318,9 @@ class Team:
         pair.is_judged = True
         first, second = sorted((self._robot, name))
         before = pair.join
-        theirs = self._placements.get((name, first, second))
-        confirmed = theirs.pose if theirs is not None and theirs.verdict is Verdict.JOINED else None
+        has_lasted = before.is_joined or was_sure(pair.search, meeting, self._configuration)
         is_first = self._robot == first
-        pair.join = next_join(
-            before, meeting, pair.keyframes, self._configuration, is_first=is_first, confirmed=confirmed
-        )
+        pair.join = next_join(before, meeting, self._configuration, is_first=is_first, has_lasted=has_lasted)
         ground = self._joined_ground(name, pair, before)
         now = _placement(self._robot, first, second, meeting)
         if meeting.verdict in (Verdict.JOINED, Verdict.OPEN):

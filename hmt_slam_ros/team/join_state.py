@@ -1,80 +1,46 @@
-"""Joins of two robots' maps that grow: a placement joins them when it has lasted, until it is no longer probable."""
+"""Joins of two robots' maps that grow: by a placement that was sure before, until it is no longer probable."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 from hmt_slam_ros.configuration.tree import Configuration
-from hmt_slam_ros.messages.map_changes import Pose
 from hmt_slam_ros.messages.team import JoiningArc, Verdict
 from hmt_slam_ros.team.join import Meeting
-from hmt_slam_ros.team.placement import is_same_placement
 
 _MIN_PROBABILITY = 0.5
 """Probability of the best placement below which a join is withdrawn."""
-
-_CONFIRMING_KEYFRAMES = 20
-"""New keyframes of both robots with which a placement has to stay sure before it joins them: many are tried."""
-
-
-@dataclass(frozen=True, eq=False)
-class SurePlacement:
-    """A placement that is sure, and that joins two maps when it has lasted.
-
-    :ivar keyframes: number of keyframes of both maps when it became sure.
-    :ivar pose: shape (3,), of the placement then, m, rad.
-    """
-
-    keyframes: int
-    pose: Pose
 
 
 @dataclass(frozen=True, eq=False)
 class JoinState:
     """How far the join with another robot's map is.
 
-    :ivar sure: the placement that is sure, None where none is.
     :ivar is_joined: whether the two maps are joined.
     :ivar joining_arcs: of the join, with ``team.uses_ground``; none without.
     :ivar sent_version: of the other map, up to which its ground was sent to TLCA.
     """
 
-    sure: SurePlacement | None = None
     is_joined: bool = False
     joining_arcs: tuple[JoiningArc, ...] = ()
     sent_version: int = 0
 
 
 def next_join(
-    join: JoinState,
-    meeting: Meeting,
-    keyframes: int,
-    configuration: Configuration,
-    *,
-    is_first: bool,
-    confirmed: Pose | None = None,
+    join: JoinState, meeting: Meeting, configuration: Configuration, *, is_first: bool, has_lasted: bool
 ) -> JoinState:
     """How far a join is after a comparison.
 
-    :param keyframes: number of keyframes of both maps.
     :param is_first: whether the first component is the robot's own.
-    :param confirmed: shape (3,), the placement that has lasted with the other robot, None without.
+    :param has_lasted: whether the placement was sure before, too: many are tried, so that it joins only then.
     """
     if join.is_joined and not _may_hold(meeting):
         return JoinState()
-    if meeting.verdict is not Verdict.JOINED:
-        return replace(join, sure=None)
-    best = meeting.distribution.best
-    assert best is not None
-    sure = join.sure
-    if sure is None or not is_same_placement(sure.pose, best.pose):
-        sure = SurePlacement(keyframes, best.pose)
-    is_confirmed = confirmed is not None and is_same_placement(confirmed, best.pose)
-    if not join.is_joined and not is_confirmed and keyframes - sure.keyframes < _CONFIRMING_KEYFRAMES:
-        return replace(join, sure=sure)
+    if meeting.verdict is not Verdict.JOINED or not (join.is_joined or has_lasted):
+        return join
     # Registration takes longer than the comparison, and only those who use the ground need the arcs.
     arcs = _joining_arcs(join, meeting, configuration, is_first=is_first) if configuration.team.uses_ground else ()
-    return replace(join, sure=sure, is_joined=True, joining_arcs=arcs)
+    return replace(join, is_joined=True, joining_arcs=arcs)
 
 
 def _joining_arcs(
