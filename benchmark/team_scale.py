@@ -50,22 +50,22 @@ class TeamCost(NamedTuple):
 
 def measure_team_scale(settings: Settings) -> Report:
     """Measure lattices of growing size."""
-    costs = [cost_in(lattice, settings.configuration) for lattice in LATTICES]
+    costs = [measure_cost(lattice, settings.configuration) for lattice in LATTICES]
     report = Report("team_scale", "Cost of the process team in large maps")
     report.requirements = requirements(costs)
     report.body = [cost_table(costs), POLICY]
     return report
 
 
-def cost_in(lattice: Lattice, configuration: Configuration, steps: int = _STEPS) -> TeamCost:
+def measure_cost(lattice: Lattice, configuration: Configuration, steps: int = _STEPS) -> TeamCost:
     """The cost where two robots have the same lattice.
 
     :param steps: most steps of the search.
     """
     known, search = _component(lattice), PlacementSearch(configuration)
-    update, _ = _timed(lambda: search.update(combine(known, _component(lattice))))
-    spent, done = _timed(lambda: next((n for n in range(steps) if not search.step()), steps))
-    comparison, _ = _timed(search.distribution)
+    update, _ = _measure_time(lambda: search.update(combine(known, _component(lattice))))
+    spent, done = _measure_time(lambda: next((n for n in range(steps) if not search.step()), steps))
+    comparison, _ = _measure_time(search.distribution)
     return TeamCost(lattice.areas, len(search.windows), update, spent / max(1, done), comparison)
 
 
@@ -75,7 +75,7 @@ def _component(lattice: Lattice) -> Component:
     return Component.of_map(hybrid_map, {keyframe: scans[keyframe] for keyframe in keyframes}, NO_CLUTTER)
 
 
-def _timed(function: Callable[[], _Result]) -> tuple[float, _Result]:
+def _measure_time(function: Callable[[], _Result]) -> tuple[float, _Result]:
     """CPU time of a call, s, and what it returns."""
     begin = time.process_time()
     result = function()

@@ -266,7 +266,7 @@ def _grow_placements(
     """
     seeds = [(w, n) for w, own in enumerate(candidates) for n in range(len(own))]
     seeds.sort(key=lambda seed: -candidates[seed[0]][seed[1]].log_ratio)
-    spots = [_Spots.of_candidates(geometry, own) for own in candidates]
+    locations = [_Locations.of_candidates(geometry, own) for own in candidates]
     grown: list[_Growth] = []
     covered: set[tuple[int, int]] = set()
     for seed in seeds:
@@ -274,14 +274,14 @@ def _grow_placements(
             break
         if seed in covered:
             continue
-        growth = _grow(geometry, candidates, spots, seed)
+        growth = _grow(geometry, candidates, locations, seed)
         if not growth.covered & covered:
             grown.append(growth)
         covered |= growth.covered
     return grown
 
 
-class _Spots(NamedTuple):
+class _Locations(NamedTuple):
     """Where the n candidates of a window are.
 
     :ivar positions: shape (n, 2), in the frame of the first component, m.
@@ -292,7 +292,7 @@ class _Spots(NamedTuple):
     reaches: Float64
 
     @classmethod
-    def of_candidates(cls, geometry: PlacementGeometry, candidates: Sequence[WindowCandidate]) -> _Spots:
+    def of_candidates(cls, geometry: PlacementGeometry, candidates: Sequence[WindowCandidate]) -> _Locations:
         positions = [geometry.map_pose(c.area, c.belief.mean)[:2] for c in candidates]
         reaches = [_REACH + _REACH_SIGMAS * _deviation(c.belief) for c in candidates]
         return cls(np.reshape(positions, (-1, 2)), np.array(reaches))
@@ -311,7 +311,7 @@ def _deviation(belief: PoseGaussian) -> float:
 def _grow(
     geometry: PlacementGeometry,
     candidates: Sequence[Sequence[WindowCandidate]],
-    spots: Sequence[_Spots],
+    locations: Sequence[_Locations],
     seed: tuple[int, int],
 ) -> _Growth:
     """The placement that a candidate implies, with the windows that agree, from the nearest in time on."""
@@ -323,7 +323,7 @@ def _grow(
         if predicted is None:
             continue
         area, belief = predicted
-        near = spots[window].near(geometry.map_pose(area, belief.mean), _deviation(belief))
+        near = locations[window].near(geometry.map_pose(area, belief.mean), _deviation(belief))
         log_shares = {n: geometry.log_share(candidates[window][n], area, belief) for n in near}
         log_ratios = {
             n: _log_mixture(log_share, candidates[window][n].log_ratio)
