@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmark import tail
 from benchmark.logs import LOGS, open_logs
-from benchmark.merging import COMMON, are_right, distances_between, window_errors
+from benchmark.placement_truth import COMMON, MIN_OVERLAP, are_right, distances_between, window_errors
 from benchmark.report import Columns, Report, Requirement, mean, table_of
 from benchmark.runs import PARAMETERS, Case
 from benchmark.settings import Settings, chosen_seeds
@@ -45,9 +45,6 @@ SIZES = (2, 3, 4, 5, 6)
 
 CUTS = (0.3, 0.45, 0.6, 0.75)
 """Where recorded logs are cut, as shares of their time."""
-
-MIN_OVERLAP = 10.0
-"""Path on common ground from which a join counts as due, m."""
 
 _STEP = 0.2
 """Distance of the positions between which ground is common, m."""

@@ -6,7 +6,11 @@ import shutil
 
 import pytest
 
+from benchmark.merging import MappedHalf, merge_halves
 from hmt_slam_ros.cli.main import FAULT, main
+from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.evaluation import read_true_poses, read_tum
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.grids.occupancy_map import read_map
 from hmt_slam_ros.hybrid_map.shortest_path import map_pieces
 from hmt_slam_ros.open_log import open_log
@@ -100,3 +104,19 @@ def test_a_map_of_another_version_is_refused(maps, tmp_path, capsys):
     manifest = tmp_path / "two" / "hmt_map" / "manifest.json"
     manifest.write_text(manifest.read_text().replace(f'"version": {VERSION}', '"version": 3'))
     assert "map the log again" in fault(capsys, maps / "one", tmp_path / "two", "--out", tmp_path / "out")
+
+
+def test_programs_that_merge_grids_are_judged_by_the_true_poses(maps, tmp_path):
+    truth = read_true_poses(open_log(WORLD))
+    one, two = (MappedHalf("office", name, maps / name, truth) for name in ("one", "two"))
+    # The frame of each map in that of the truth, by its first pose.
+    paths = [read_tum(half.folder / "trajectory.tum") for half in (one, two)]
+    starts = [truth.poses[truth.nearest_indices(path.stamps[:1])[0]] for path in paths]
+    x, y, yaw = se2.between(*map(se2.compose, starts, [se2.inverse(path.poses[0]) for path in paths]))
+    programs = {name: tmp_path / name for name in ("exact", "moved")}
+    for path, shift in zip(programs.values(), (0.0, 1.2), strict=True):
+        path.write_text(f'#!/bin/sh\n[ -f "$1" ] && [ -f "$2" ] && echo {x + shift} {y} {yaw} 1.5\n')
+        path.chmod(0o755)
+    found = merge_halves(Configuration(), one, two, programs)
+    assert (found.outcome, found.is_due) == ("right", True)
+    assert {each.program: each.outcome for each in found.programs} == {"exact": "right", "moved": "wrong"}
