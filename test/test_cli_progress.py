@@ -80,8 +80,10 @@ def test_a_log_without_scans_or_time_divides_by_nothing(tty: bool) -> None:
         progress(0)
 
 
-def test_the_summary_says_of_how_many_logs_the_scans_are() -> None:
+def test_the_summary_counts_the_scans_of_the_newest_log() -> None:
     recording = make_recorder().finish(STAMPS)
     assert f" of {SCANS} scans, 0 dropped" in summary(Path("out"), recording, 10.0, 1.0)
     further = replace(recording, first_scans=(0, SCANS // 2))
-    assert f" of {SCANS} scans of 2 logs, 0 dropped" in summary(Path("out"), further, 10.0, 1.0)
+    own = SCANS - SCANS // 2
+    sentence = summary(Path("out"), further, 10.0, 1.0)
+    assert f"out: {own} of {own} scans beside {SCANS // 2} of one log before, 0 dropped" in sentence

@@ -20,7 +20,7 @@ from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.results.hmt_map import MapWriter, SavedMap, read_saved_map
 from hmt_slam_ros.results.pieces import split_map
-from hmt_slam_ros.results.plots import _draw_piece, plot_map
+from hmt_slam_ros.results.plots import _break_at_jumps, _draw_piece, plot_map
 from hmt_slam_ros.results.trajectories import RelativeTrajectory
 
 FRAMES = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [2.0, 1.0, 0.5], [4.0, 1.0, 0.5]])
@@ -71,6 +71,14 @@ def draw(folder: Path, *covariances: np.ndarray) -> tuple[Figure, np.ndarray, Oc
 
 def hatches(figure: Figure) -> list[str | None]:
     return [patch.get_hatch() for patch in figure.axes[0].patches]
+
+
+def test_no_line_leads_from_where_the_robot_was_taken_to_where_it_was_put() -> None:
+    driven = np.array([[0.1 * step, 0.0, 0.0] for step in range(5)])
+    trajectory = np.concatenate([driven, driven + np.array([9.0, 4.0, 1.0])])
+    broken = _break_at_jumps(trajectory)
+    assert np.flatnonzero(np.isnan(broken).any(axis=1)).tolist() == [5]
+    np.testing.assert_array_equal(_break_at_jumps(driven), driven)
 
 
 def test_the_extent_is_that_of_the_map_however_large_an_ellipse_is(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """Localization: the robot finds its place in a map that stays as it was loaded, until the mode is changed."""
 
+import json
+
 import numpy as np
 import pytest
 from logs_for_nodes import PACE
@@ -88,6 +90,11 @@ def test_offline_too_the_map_stays_as_it_was(corridor, tmp_path):
 
     found = run_map("--from", out, "--mode", "localization", "--start", "4.0")
     assert found.returncode == 0, found.stderr
+    assert f"out: {SCANS - 20} of {SCANS - 20} scans beside {SCANS} of one log before, 0 dropped; " in found.stdout
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["scans"] == {"in": SCANS - 20, "processed": SCANS - 20, "dropped": 0}
+    assert report["scans_of_earlier_logs"] == SCANS
+    assert report["travelled_m"] == pytest.approx(4 * (SCANS - 20) * PACE[0], rel=0.1)
     assert content(tmp_path / "out" / "hmt_map") == content(out / "hmt_map")
     poses = np.loadtxt(tmp_path / "out" / "trajectory.tum")
     assert np.abs(poses[-1, 1:3] - 4 * (SCANS - 1) * PACE[:2]).max() < 0.1

@@ -131,6 +131,10 @@ def _duration(seconds: float) -> str:
     return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
+def _count_logs(count: int) -> str:
+    return "one log" if count == 1 else f"{count} logs"
+
+
 TERMINATED = 143
 """Exit status after SIGTERM."""
 
@@ -188,10 +192,10 @@ def summary(directory: Path, recording: Recording, log_seconds: float, wall_seco
     :param wall_seconds: duration of the run, s.
     """
     arcs = [arc for _, _, arc in recording.hybrid_map.all_arcs()]
-    totals, logs = recording.totals, len(recording.first_scans)
-    of_logs = f" of {logs} logs" if logs > 1 else ""
+    own, earlier = recording.own_totals, recording.first_scans[-1]
+    before = f" beside {earlier} of {_count_logs(len(recording.first_scans) - 1)} before" if earlier else ""
     outcome = (
-        f"{directory}: {totals.processed} of {totals.received} scans{of_logs}, {totals.dropped} dropped; "
+        f"{directory}: {own.processed} of {own.received} scans{before}, {own.dropped} dropped; "
         f"areas: {len(recording.area_poses)}, arcs: {len(arcs)}, "
         f"of them loop closures: {sum(arc.closure for arc in arcs)}; "
         f"{wall_seconds:.1f} s, {log_seconds / max(wall_seconds, 1e-9):.1f} x real time"

@@ -266,13 +266,14 @@ def _format_numbers(values: NDArray[Any]) -> str:
 
 def build_report(recording: Recording, configuration: Configuration, figures: RunMetrics) -> dict[str, Any]:
     """The content of report.json."""
-    totals, replica, hybrid_map = recording.totals, recording.replica, recording.hybrid_map
+    totals, replica, hybrid_map = recording.own_totals, recording.replica, recording.hybrid_map
     arcs = [arc for _, _, arc in hybrid_map.all_arcs()]
     return {
         "log": figures.log,
         "runtime": figures.runtime,
         "scans": {"in": totals.received, "processed": totals.processed, "dropped": totals.dropped},
-        "travelled_m": recording.probabilities[-1].path_length,
+        "scans_of_earlier_logs": recording.first_scans[-1],
+        "travelled_m": recording.own_path_length,
         "keyframe_events": recording.probabilities[-1].keyframe + 1,
         "keyframes": sum(len(hybrid_map.keyframes(area)) for area in hybrid_map.area_ids()),
         "areas": len(hybrid_map.area_ids()),

@@ -39,6 +39,9 @@ _DPI = 150
 _CLOSURE, _ARC, _PATH = "#d62728", "#1f3b70", "#555555"
 """Colors of arcs that closed a loop, of other arcs and of the path."""
 
+_MAX_STEP = 2.0
+"""Longest step between two scans that is drawn, m; beyond it the robot was moved, or scans are missing."""
+
 _MIN_SHARE = 0.25
 """Least width of a piece of the map in its picture, as a share of the widest."""
 
@@ -75,6 +78,7 @@ def draw_map(directory: Path, saved: SavedMap, trajectory: Trajectory) -> Path:
     :param trajectory: shape (n, 3), ``map_T_base`` of the last n scans of the map; a line ends at NaN.
     """
     hybrid_map = saved.replica.maps[saved.replica.best_hypothesis]
+    trajectory = _break_at_jumps(trajectory)
     pieces = split_map(directory, saved, trajectory)
     sizes = np.array([np.diff(piece.corners, axis=0)[0] for piece in pieces])
     widths = np.maximum(sizes[:, 0], _MIN_SHARE * sizes[:, 0].max())
@@ -86,6 +90,14 @@ def draw_map(directory: Path, saved: SavedMap, trajectory: Trajectory) -> Path:
     row[0].set_title(_map_title(hybrid_map, trajectory[:, :2]), fontsize=9)
     row[0].legend(loc="best", fontsize=7, framealpha=0.9)
     return _save(figure, directory / "map.png")
+
+
+def _break_at_jumps(trajectory: Trajectory) -> Trajectory:
+    """The trajectory without the first scan after each jump, so that no line leads through walls."""
+    jumps = np.flatnonzero(np.hypot(*np.diff(trajectory[:, :2], axis=0).T) > _MAX_STEP) + 1
+    broken = trajectory.copy()
+    broken[jumps] = np.nan
+    return broken
 
 
 def draw_team(path: Path, surfaces: Mapping[str, NDArray[np.float64]]) -> Path:

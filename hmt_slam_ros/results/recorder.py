@@ -17,7 +17,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME, HybridMap
 from hmt_slam_ros.hybrid_map.keyframe_pruning import ReplacementKeyframe, nearest_replacement
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.messages.map_changes import AreaPose, PrunedKeyframe
@@ -86,6 +86,22 @@ class Recording:
     def hybrid_map(self) -> HybridMap:
         """The map of the most probable hypothesis."""
         return self.replica.maps[self.replica.best_hypothesis]
+
+    @property
+    def own_totals(self) -> EndOfRun:
+        """Scans of the newest log that were received, processed and dropped."""
+        first = self.first_scans[-1]
+        earlier = int((self.relative_trajectory.keyframes[:first] != NO_KEYFRAME).sum())
+        return EndOfRun(
+            self.totals.received - first, self.totals.processed - earlier, self.totals.dropped - (first - earlier)
+        )
+
+    @property
+    def own_path_length(self) -> float:
+        """Length of the path of the newest log up to its last keyframe, m."""
+        begin = self.stamps[self.first_scans[-1]]
+        earlier = [row.path_length for row in self.probabilities if row.stamp < begin]
+        return self.probabilities[-1].path_length - (earlier[-1] if earlier else 0.0)
 
 
 @dataclass
