@@ -130,7 +130,7 @@ def explore_building(seed: int, configuration: Configuration, out: Path) -> Expl
     frames = {area: (pose.mean, institute.frames[area]) for area, pose in recording.area_poses.items()}
     places = {
         name: (room.opening.area, se2.transform(frames[room.opening.area][1], room.position[None])[0])
-        for name, room in named_destinations(known_building(institute, configuration)).items()
+        for name, room in named_destinations(known_building(institute, configuration), configuration).items()
     }
     return ExploredBuilding(seed, folder, frames, places)
 

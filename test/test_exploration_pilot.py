@@ -9,6 +9,7 @@ from small_floor import AREAS, CONFIGURATION, make_map, seen_at
 
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.exploration.explorer import ExplorationMap
 from hmt_slam_ros.exploration.pilot import PilotProcess
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -110,6 +111,17 @@ def the_room(missions):
     return room
 
 
+def door_of(missions):
+    """The name of the place before the room."""
+    return f"door {missions.rooms[the_room(missions)].node}"
+
+
+def test_a_room_has_the_name_that_it_has_for_the_explorer(saved_map):
+    places = ExplorationMap(CONFIGURATION, Replica.from_state(saved_map)).named_places()
+    assert the_room(PilotProcess(CONFIGURATION, saved_map)) == "room 1"
+    assert [name for name in places if name.startswith("room")] == ["room 1"]
+
+
 def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_until_it_does(saved_map):
     missions = PilotProcess(CONFIGURATION, saved_map)
     robot, room = Robot(missions, (12.0, 0.0, math.pi), rtl="door"), the_room(missions)
@@ -128,7 +140,7 @@ def test_metric_slam_that_is_lost_begins_at_the_door_where_the_robot_stands_unti
     assert math.dist(robot.pose[:2], (5.0, 3.0)) < 0.3
     assert len(robot.starts()) == 1
     messages = robot.estimate()
-    assert (messages.place, messages.room, messages.confident) == (room.replace("room", "door"), room, True)
+    assert (messages.place, messages.room, messages.confident) == (door_of(missions), room, True)
     np.testing.assert_array_equal(robot.velocity, 0.0)
     assert robot.do("localize").text == f"localize: the robot is in {room}"
     assert robot.do(f"go {room}").succeeded
@@ -183,7 +195,7 @@ def test_where_others_drive_it_says_where_the_robot_is_and_what_a_door_tells_onc
         robot.step((0.6, 0.0, 0.0))
     for _ in range(10):
         robot.step((0.0, 0.0, -math.pi / 4.0))
-    assert (robot.estimate().place, robot.estimate().confident) == (room.replace("room", "door"), True)
+    assert (robot.estimate().place, robot.estimate().confident) == (door_of(missions), True)
     at = []
     while robot.pose[1] < 1.5:
         at.append(robot.pose)
@@ -235,7 +247,7 @@ def test_one_who_drives_the_robot_out_of_a_room_brings_it_before_the_door(saved_
     for _ in range(2):
         robot.step((0.0, 0.0, 0.0))
     messages = robot.estimate()
-    assert (messages.place, messages.room, messages.confident) == (room.replace("room", "door"), None, True)
+    assert (messages.place, messages.room, messages.confident) == (door_of(missions), None, True)
 
 
 def test_a_map_without_places_is_refused():

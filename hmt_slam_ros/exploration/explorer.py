@@ -62,8 +62,7 @@ class ExplorationMap:
 
     def __init__(self, configuration: Configuration, replica: Replica | None = None) -> None:
         """:param replica: the initial map; None for an empty one."""
-        parameters = configuration.explorer
-        self.roadmap = Roadmap(configuration.features, parameters.radius + parameters.margin, parameters.door)
+        self.roadmap = Roadmap.of_explorer(configuration)
         self.replica = replica or Replica()
         self.event = -1
         self.teammates = Teammates()

@@ -137,7 +137,7 @@ class PilotProcess:
         self._task_timeout = round(NANOSECONDS * configuration.pilot.task_timeout)
         self._edge_monitor = EdgeMonitor(self._building.graph, configuration.features)
         self._uniform_belief = uniform_belief(self._building.graph, configuration.places)
-        self.rooms = named_destinations(self._building)
+        self.rooms = named_destinations(self._building, configuration)
         self._reset()
 
     def _reset(self) -> None:
@@ -306,7 +306,7 @@ class PilotProcess:
         room = self.controller.room
         if room is None or self._task is not None:
             return
-        node, opening, _ = self.rooms[self._room_name]
+        node, opening, *_ = self.rooms[self._room_name]
         offset = se2.between(opening.landmark.pose.mean, room.pose)
         if offset[0] > -_EXIT_DISTANCE:
             return

@@ -17,6 +17,7 @@ import networkx as nx
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
 from hmt_slam_ros.exploration.frontiers import KEYFRAME_RANGE, NavigationGrid
 from hmt_slam_ros.geometry import se2
@@ -144,6 +145,12 @@ class Roadmap:
         self.frontiers: list[Frontier] = []
         # {keyframe: its area and its pose in that} at the last update.
         self._keyframe_poses: dict[int, tuple[int, Float64]] = {}
+
+    @classmethod
+    def of_explorer(cls, configuration: Configuration) -> Roadmap:
+        """An empty roadmap for the robot of the explorer's parameters."""
+        parameters = configuration.explorer
+        return cls(configuration.features, parameters.radius + parameters.margin, parameters.door)
 
     def update(self, hybrid_map: HybridMap, scans: Mapping[int, Scan], area: int, pose: Float64) -> EntryPoint | None:
         """Update roadmap and frontiers around the robot.
@@ -322,6 +329,12 @@ class Roadmap:
             (own for own in self.segments() if len(own) >= _MIN_ROOM_KEYFRAMES and self.is_room(own)), key=min
         )
         return [self._keyframes_beside(nx.barycenter(self.graph.subgraph(room), weight="length")[0]) for room in rooms]
+
+    def room_numbers(self) -> dict[int, int]:
+        """{keyframe in an entered room: its number, from 1 on, in the order of :meth:`rooms`}."""
+        middles = {room[0]: number for number, room in enumerate(self.rooms(), 1)}
+        numbered = ((segment, middles.keys() & segment) for segment in self.segments())
+        return {keyframe: middles[middle] for segment, found in numbered for middle in found for keyframe in segment}
 
     def is_room(self, segment: Collection[int]) -> bool:
         """Whether at least half of the keyframes of a segment are in a room; the end of a hallway looks like one."""

@@ -16,6 +16,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.exploration.roadmap import Roadmap
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import Neighborhood, areas_around, stack_poses
@@ -86,11 +87,13 @@ class Destination(NamedTuple):
 
     :ivar node: before the room's door.
     :ivar opening: the door.
-    :ivar position: shape (2,), in the frame of the opening's area, m.
+    :ivar keyframe: at that place.
+    :ivar position: shape (2,), of the keyframe in the frame of the opening's area, m.
     """
 
     node: int
     opening: SideOpening
+    keyframe: int
     position: Float64
 
     @property
@@ -105,14 +108,28 @@ def destinations(known: KnownBuilding) -> dict[int, Destination]:
     return {destination.node: destination for destination in _all_destinations(known)}
 
 
-def named_destinations(known: KnownBuilding) -> dict[str, Destination]:
-    """{name: destination}: "room 3" is behind "door 3", with a direction if there are rooms on both sides."""
-    all_destinations = list(_all_destinations(known))
-    nodes = [destination.node for destination in all_destinations]
-    return {
-        f"room {each.node}" + f" {DIRECTION_NAMES[each.opening.direction]}" * (nodes.count(each.node) > 1): each
-        for each in all_destinations
-    }
+def named_destinations(known: KnownBuilding, configuration: Configuration) -> dict[str, Destination]:
+    """{name: destination}: "room 3" has the number that it has for the explorer, which begins with this map.
+
+    A further door of a room is "room 3 by door 7". What the explorer takes for a hallway has a number after the rooms.
+    """
+    numbers = _roadmap(known, configuration).room_numbers()
+    named: dict[str, Destination] = {}
+    further = max(numbers.values(), default=0)
+    for each in _all_destinations(known):
+        if each.keyframe not in numbers:
+            further += 1
+        room = f"room {numbers.get(each.keyframe, further)}"
+        door = f"{room} by door {each.node}"
+        names = (room, door, f"{door} {DIRECTION_NAMES[each.opening.direction]}")
+        named[next(name for name in names if name not in named)] = each
+    return named
+
+
+def _roadmap(known: KnownBuilding, configuration: Configuration) -> Roadmap:
+    roadmap = Roadmap.of_explorer(configuration)
+    roadmap.update_everywhere(known.hybrid_map, known.scans)
+    return roadmap
 
 
 def _all_destinations(known: KnownBuilding) -> Iterator[Destination]:
@@ -120,20 +137,22 @@ def _all_destinations(known: KnownBuilding) -> Iterator[Destination]:
     with_edge = {edge.end for edge in known.chart.edges}
     for number, node in enumerate(known.chart.nodes):
         for opening in node.openings if node.kind == DOOR and number in with_edge else ():
-            position = _position_behind(known, opening)
-            if position is not None:
-                yield Destination(number, opening, position)
+            farthest = _farthest_behind(known, opening)
+            if farthest is not None:
+                yield Destination(number, opening, *farthest)
 
 
-def _position_behind(known: KnownBuilding, opening: SideOpening) -> Float64 | None:
-    """The position of the farthest keyframe behind an opening, m, shape (2,); None for none."""
-    poses = stack_poses(known.keyframe_poses_around(opening.area))
+def _farthest_behind(known: KnownBuilding, opening: SideOpening) -> tuple[int, Float64] | None:
+    """The farthest keyframe behind an opening, and its position, m, shape (2,); None for none."""
+    around = known.keyframe_poses_around(opening.area)
+    poses = stack_poses(around)
     ahead, lateral = se2.transform(se2.inverse(opening.landmark.pose.mean), poses[:, :2]).T
     nearest, farthest = _DISTANCES_BEHIND
     within = (nearest <= ahead) & (ahead <= farthest) & (np.abs(lateral) <= _MAX_SLOPE * ahead)
     if not within.any():
         return None
-    return np.asarray(poses[int(np.argmax(np.where(within, ahead, -np.inf))), :2])
+    row = int(np.argmax(np.where(within, ahead, -np.inf)))
+    return list(around)[row], np.asarray(poses[row, :2])
 
 
 class RoomFilter:

@@ -291,7 +291,9 @@ class PilotNode(TaskNode):
             raise HmtSlamError("the pilot goes by the places of a map, and there is none: set start_from")
         self.area_poses = GlobalPoses(document.area_poses)
         pilot = PilotProcess(self.configuration, document.replica)
-        self.get_logger().info(f"rooms to go to: {', '.join(pilot.rooms) or 'none'}")
+        rooms = ", ".join(f"{name} behind door {room.node}" for name, room in pilot.rooms.items())
+        self.diagnostics.values["rooms"] = rooms or "none"
+        self.get_logger().info(f"rooms to go to: {rooms or 'none'}")
         return pilot
 
     def on_message(self, message: Message) -> None:
