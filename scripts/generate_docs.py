@@ -176,7 +176,7 @@ _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
     ),
     "robot": ("hmt/local_estimate", "hmt/tracking_reset", "diagnostics"),
     "team": ("hmt/reset_request", "rendezvous"),
-    "explorer": ("hmt/reset_request", "tf_static"),
+    "explorer": ("hmt/reset_request", "tf_static", "odom"),
     "pilot": ("hmt/reset_request", "tf_static"),
     "recorder": ("hmt/area_events", "hmt/robot_status", "diagnostics", "hmt/cost"),
     "operator": (

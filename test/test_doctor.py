@@ -399,6 +399,8 @@ HEAD = ScanHeader("laser", -1.0, 1.0, 0.02, 101)
         ({"two parents": "wrong"}, {"transforms": (LASER, WHEELS, joint("map", "base_link"))}),
         ({"static transform moves": "doubtful"}, {"transforms": (joint("base_link", "laser", moved=0.1), WHEELS)}),
         ({"map -> odom": "doubtful"}, {"transforms": (LASER, WHEELS, joint("map", "odom", topic="/tf"))}),
+        ({"frames contradict": "wrong"}, {"odometry_frames": ("wheel_odom", "base_link")}),
+        ({}, {"transforms": (LASER, WHEELS, joint("base_link", "foot")), "odometry_frames": ("odom", "foot")}),
         ({"odometry frames": "doubtful"}, {"odometry_frames": ("odom", "")}),
         ({"odometry frames": "doubtful"}, {"odometry_frames": ("map", "base_link")}),
         ({"scan frame": "wrong"}, {"scan_headers": {HEAD._replace(frame=""): 3}}),

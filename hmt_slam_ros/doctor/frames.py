@@ -166,6 +166,7 @@ def frame_findings(messages: MessageStatistics) -> Iterator[Finding]:
     yield from _check_static(messages)
     yield from _check_tilt(messages)
     yield from _check_map_to_odom(messages)
+    yield from _check_odometry_transform(messages)
     odom, base = messages.odometry_frames
     frames = ", ".join(sorted({header.frame for header in messages.scan_headers}))
     yield Finding("fine", "frames", f"Odometry is {odom} -> {base}, scans are in {frames}.")
@@ -230,3 +231,19 @@ def _check_map_to_odom(messages: MessageStatistics) -> Iterator[Finding]:
             "or leave them away when the bag is played for the nodes, since rtl publishes the same."
         )
         yield Finding("doubtful", "map -> odom", text)
+
+
+def _check_odometry_transform(messages: MessageStatistics) -> Iterator[Finding]:
+    """A finding where the transforms lead from the robot's frame up to another one than that of the odometry."""
+    odom, base = messages.odometry_frames
+    above, new = {base}, {base}
+    while new:
+        new = {transform.parent for transform in messages.transforms if transform.child in new} - above
+        above |= new
+    if len(above) > 1 and odom not in {"", base, "map", *above}:
+        text = (
+            f"The odometry is that of {odom!r} -> {base!r}, and transforms lead from {base!r} up to "
+            f"{' and '.join(sorted(above - {base}))}, so that map -> {odom} of rtl does not lead to the robot: give "
+            "both one name."
+        )
+        yield Finding("wrong", "frames contradict", text)

@@ -72,6 +72,21 @@ class NodeStatus(NamedTuple):
     state: str = ""
 
 
+class FrameContradiction(NamedTuple):
+    """A parameter that names another frame than the messages of the odometry.
+
+    :ivar node: name of the node.
+    :ivar parameter: name of the parameter.
+    :ivar frame: its value.
+    :ivar odometry_frame: the frame in the messages.
+    """
+
+    node: str
+    parameter: str
+    frame: str
+    odometry_frame: str
+
+
 @dataclass(frozen=True)
 class RunningSystem:
     """Observations of a running system.
@@ -86,6 +101,7 @@ class RunningSystem:
     :ivar conflicting_transforms: {transform: number of stamps for which two sources published different values}.
     :ivar missing_laser_transform: sentence about a missing transform of the laser, empty where none is missing.
     :ivar other_namespaces: other namespaces with nodes of ours.
+    :ivar frame_contradictions: parameters of nodes that name other frames than the odometry.
     """
 
     seconds: float
@@ -97,6 +113,7 @@ class RunningSystem:
     conflicting_transforms: Mapping[str, int]
     missing_laser_transform: str
     other_namespaces: tuple[str, ...] = ()
+    frame_contradictions: tuple[FrameContradiction, ...] = ()
 
 
 def running_findings(running: RunningSystem) -> Iterator[Finding]:
@@ -107,6 +124,7 @@ def running_findings(running: RunningSystem) -> Iterator[Finding]:
     yield from _check_silence(running, all_active=not states)
     yield from _check_qos(running)
     yield from _check_publishers(running)
+    yield from _check_frames(running)
     yield from _check_clock(running)
     yield from _check_diagnostics(running)
 
@@ -224,6 +242,15 @@ def _check_publishers(running: RunningSystem) -> Iterator[Finding]:
             f"of {_join_names(running.topics[TF].publishers)}; stop one of them (or its publish_tf)."
         )
         yield Finding("wrong", "two transforms", text)
+
+
+def _check_frames(running: RunningSystem) -> Iterator[Finding]:
+    for node, parameter, frame, odometry_frame in running.frame_contradictions:
+        text = (
+            f"{node} has {parameter} = {frame}, and the odometry is that of {odometry_frame}, so that the tree of "
+            f"transforms is in two parts: leave {parameter} empty, or set it to {odometry_frame}."
+        )
+        yield Finding("wrong", "frames contradict", text)
 
 
 def _check_clock(running: RunningSystem) -> Iterator[Finding]:

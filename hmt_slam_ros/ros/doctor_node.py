@@ -31,7 +31,7 @@ from hmt_slam_ros.doctor import running
 from hmt_slam_ros.doctor.examination import statistics_findings
 from hmt_slam_ros.doctor.finding import Finding, sorted_findings
 from hmt_slam_ros.doctor.frames import MessageStatistics, ScanHeader, TransformCollector
-from hmt_slam_ros.doctor.running import Mismatch, NodeStatus, RunningSystem, Topic
+from hmt_slam_ros.doctor.running import FrameContradiction, Mismatch, NodeStatus, RunningSystem, Topic
 from hmt_slam_ros.doctor.statistics import Gatherer
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.mounting import FrameTree, Mounting, frame_name, planar_mounting
@@ -40,6 +40,7 @@ from hmt_slam_ros.logs.stamps import running_stamps
 from hmt_slam_ros.process_table import producer, topic_of
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import STATE
+from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, ODOM_FRAME
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, TFMessage
 from hmt_slam_ros.sensors import Odometry, Scan
 
@@ -50,6 +51,7 @@ _DISCOVERY_TIMEOUT = 5.0
 """Time in which DDS finds the first other node, s."""
 _SPIN = 0.05  # s
 _USE_SIM_TIME, _LASER_POSE = "use_sim_time", "laser_pose"
+_PARAMETERS = (_USE_SIM_TIME, _LASER_POSE, ODOM_FRAME, BASE_FRAME)
 _GRAPH_ONLY_TOPICS = ("map", "pose", *map(topic_of, ("KeyframeHeader", "Hypotheses", "ClosureDecision")))
 _ODOM_FRAME, _BASE_FRAME = "odom", "base_link"
 _MAP_TO_ODOM_NODE = producer("RealTimePose")
@@ -145,8 +147,7 @@ class DoctorNode(Node):
             if client.service_is_ready():
                 # One by one: a node that lacks one of several answers with none.
                 self._parameter_futures[full] = {
-                    name: client.call_async(GetParameters.Request(names=[name]))
-                    for name in (_USE_SIM_TIME, _LASER_POSE)
+                    name: client.call_async(GetParameters.Request(names=[name])) for name in _PARAMETERS
                 }
 
     def findings(self, seconds: float) -> list[Finding]:
@@ -226,7 +227,18 @@ class DoctorNode(Node):
             dict(self._conflicting_transforms),
             self._missing_laser_transform(),
             tuple(sorted(namespace for namespace, names in nodes.items() if set(names) & set(running.OUR_NODES))),
+            tuple(self._frame_contradictions()),
         )
+
+    def _frame_contradictions(self) -> Iterator[FrameContradiction]:
+        """Parameters of our nodes in this namespace that name other frames than the odometry."""
+        for node in running.OUR_NODES:
+            full = f"{self.get_namespace().rstrip('/')}/{node}"
+            for parameter, odometry_frame in zip((ODOM_FRAME, BASE_FRAME), self._odometry_frames, strict=True):
+                known = full in self._parameter_futures
+                frame = frame_name(self._parameter_value(full, parameter).string_value) if known else ""
+                if frame and odometry_frame and frame != odometry_frame:
+                    yield FrameContradiction(full, parameter, frame, odometry_frame)
 
     def _topic(self, name: str, message_count: int | None) -> Topic:
         full = self.resolve_topic_name(name)

@@ -17,8 +17,9 @@ from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import scan_from_message, stamp_from_time
 from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
 from hmt_slam_ros.ros.guarded_node import GuardedNode
+from hmt_slam_ros.ros.odometry_frames import OdometryFrames
 from hmt_slam_ros.ros.recovery import FrameMounting
-from hmt_slam_ros.ros.topics import TFMessage
+from hmt_slam_ros.ros.topics import ODOM, TFMessage
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.plausibility import (
     MAX_COORDINATE,
@@ -57,19 +58,19 @@ class LaserMountings:
         self,
         node: GuardedNode,
         diagnostics: NodeDiagnostics,
-        base_frame: str,
+        frames: OdometryFrames,
         fixed_pose: NDArray[np.float64] | None,
         on_change: Callable[[], None] | None = None,
         on_new_mounting: Callable[[FrameMounting], None] | None = None,
     ) -> None:
         """Subscribe to /tf_static, unless the pose is given.
 
-        :param base_frame: the robot's frame.
+        :param frames: that of the robot may be unknown at first.
         :param fixed_pose: ``base_T_laser`` (3,) of all lasers, None to take it from transforms.
         :param on_change: called after new transforms.
         :param on_new_mounting: called with each new or changed mounting.
         """
-        self._diagnostics, self._base_frame, self._fixed_pose = diagnostics, base_frame, fixed_pose
+        self._diagnostics, self._odometry_frames, self._fixed_pose = diagnostics, frames, fixed_pose
         self._frames = FrameTree(newest=True)
         self._mountings: dict[str, FrameMounting] = {}
         self._on_change, self._on_new_mounting = on_change, on_new_mounting
@@ -118,12 +119,17 @@ class LaserMountings:
 
         :raises HmtSlamError: where it is tilted or far from the robot.
         """
-        transform = frames.lookup_transform(frame_name(self._base_frame), frame_name(frame))
+        transform = self._lookup_transform(frames, frame)
         if transform is None:
             return None
         mounting = planar_mounting(transform, f"the laser '{frame}'")
         check_planar_pose(mounting.laser_pose, f"the pose of the laser '{frame}'", MAX_LASER_OFFSET)
         return mounting
+
+    def _lookup_transform(self, frames: FrameTree, frame: str) -> NDArray[np.float64] | None:
+        """The transform from the robot to a frame, shape (4, 4), None while it is unknown."""
+        base = self._odometry_frames.base
+        return frames.lookup_transform(base, frame_name(frame)) if base else None
 
     def _adopt(self, frame: str, mounting: Mounting | None) -> None:
         known = self._mountings.get(frame)
@@ -143,7 +149,7 @@ class LaserMountings:
         return (
             self._fixed_pose is not None
             or frame in self._mountings
-            or self._frames.lookup_transform(frame_name(self._base_frame), frame_name(frame)) is not None
+            or self._lookup_transform(self._frames, frame) is not None
         )
 
     def convert_scan(self, message: LaserScan) -> Scan | None:
@@ -161,9 +167,15 @@ class LaserMountings:
 
     def missing_transform_text(self, scan: LaserScan, waiting: int) -> str:
         """One sentence for a scan whose transform is missing; ``waiting`` is the number of such scans."""
+        stamp, base = stamp_from_time(scan.header.stamp), self._odometry_frames.base
+        if not base:
+            return (
+                f"no odometry has come, whose child_frame_id is the robot's frame, so {waiting} scans wait, the first "
+                f"of stamp {stamp} ns: look at the topic {ODOM}, or set the parameter base_frame"
+            )
         cause = "" if TFMessage is not None else " (tf2_msgs is not installed)"
         return (
-            f"no transform from '{self._base_frame}' to '{scan.header.frame_id}' on /tf_static{cause}, so {waiting} "
-            f"scans wait, the first of stamp {stamp_from_time(scan.header.stamp)} ns: publish it, or set the parameter "
+            f"no transform from '{base}' to '{scan.header.frame_id}' on /tf_static{cause}, so {waiting} "
+            f"scans wait, the first of stamp {stamp} ns: publish it, or set the parameter "
             "laser_pose"
         )

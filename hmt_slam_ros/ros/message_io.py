@@ -30,6 +30,7 @@ from hmt_slam_ros.ros.chain_order import CHAIN, ChainMessage, ChainOrder
 from hmt_slam_ros.ros.chain_writer import ChainWriter
 from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
 from hmt_slam_ros.ros.guarded_node import GuardedNode
+from hmt_slam_ros.ros.odometry_frames import OdometryFrames
 from hmt_slam_ros.ros.sensor_input import SensorSubscription
 from hmt_slam_ros.ros.topics import DOCUMENTS, FINISHED, KEYFRAME_SCANS, KEYFRAMES, ODOM, SCAN_POSES
 from hmt_slam_ros.sensors import Odometry
@@ -59,6 +60,7 @@ class Inbox:
         reset_number: int | None = None,
         resume_stamps: Mapping[str, int] | None = None,
         gate: ChainGate | None = None,
+        odometry_frames: OdometryFrames | None = None,
     ) -> None:
         """Subscribe.
 
@@ -69,7 +71,9 @@ class Inbox:
         :param reset_number: number of the node's last reset, 0 before the first; None to accept messages of any.
         :param resume_stamps: {measurement type: stamp, ns} after which past ones are wanted too.
         :param gate: with the hypotheses that are alive; without one they are not known yet.
+        :param odometry_frames: take note of the odometry's frames, where the node needs them.
         """
+        self._odometry_frames = odometry_frames
         self._resume_stamps, self._reset_number = resume_stamps or {}, reset_number
         self._early: list[tuple[int, Callable[[], None]]] = []
         self._message_types = message_types = tuple(message_types)
@@ -158,7 +162,7 @@ class Inbox:
                 self._diagnostics,
                 OdometryMessage,
                 ODOM,
-                conversions.odometry_from_message,
+                self._convert_odometry,
                 self.receive,
                 self._resume_stamps.get("Odometry"),
             )
@@ -171,6 +175,12 @@ class Inbox:
         self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile = topics.CHAIN
     ) -> None:
         self._node.create_subscription(kind, topic, callback, profile)
+
+    def _convert_odometry(self, message: OdometryMessage) -> Odometry:
+        reading = conversions.odometry_from_message(message)
+        if self._odometry_frames is not None:
+            self._odometry_frames.note(message)
+        return reading
 
     def _on_scan_poses(self, message: Path) -> None:
         self.receive(conversions.scan_poses_from_message(message, self._system.admit))

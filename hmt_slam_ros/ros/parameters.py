@@ -139,9 +139,9 @@ def declare_system(node: Node) -> SystemName:
     return SystemName(str(node.declare_parameter("system", "", descriptor).value))
 
 
-def declare_frame(node: Node, which: str, default: str) -> str:
-    """Declare the parameter ``<which>_frame``, and return the name of the frame."""
-    descriptor = ParameterDescriptor(description=f"Name of the {which} frame.", read_only=True)
+def declare_frame(node: Node, which: str, default: str, note: str = "") -> str:
+    """Declare the parameter ``<which>_frame``, and return the name of the frame; ``note`` ends its description."""
+    descriptor = ParameterDescriptor(description=f"Name of the {which} frame{note}.", read_only=True)
     return str(node.declare_parameter(f"{which}_frame", default, descriptor).value)
 
 

@@ -29,6 +29,7 @@ from hmt_slam_ros.ros.execution import force_exit_after, lower_priority, spin_un
 from hmt_slam_ros.ros.initial_state import InitialState, declare_start_from, declare_start_lost
 from hmt_slam_ros.ros.journal import UnreadableInput
 from hmt_slam_ros.ros.message_io import Inbox, Outbox
+from hmt_slam_ros.ros.odometry_frames import OdometryFrames
 from hmt_slam_ros.ros.publisher_monitor import PublisherMonitor
 from hmt_slam_ros.ros.recovery import (
     ActivationChange,
@@ -61,6 +62,7 @@ class ProcessNode(ParticipantNode):
 
     :cvar is_always_listening: whether the process also gets messages while the node is inactive.
     :cvar team_types: classes of messages between robots, for which the node has subscriptions and writers of its own.
+    :ivar odometry_frames: frames of the odometry, where the node needs them.
     :ivar save_on_shutdown: whether the map is saved before the node ends.
     :ivar process: the process, from :meth:`configure_node` on.
     :ivar reset_number: number of the last reset request that was answered, 0 before the first.
@@ -69,6 +71,7 @@ class ProcessNode(ParticipantNode):
 
     is_always_listening = False
     team_types: tuple[type, ...] = ()
+    odometry_frames: OdometryFrames | None = None
     save_on_shutdown = False
 
     def __init__(self, name: str) -> None:
@@ -146,6 +149,7 @@ class ProcessNode(ParticipantNode):
             reset_number=self.reset_number,
             resume_stamps=self.resume_stamps,
             gate=_gate(self.initial_state),
+            odometry_frames=self.odometry_frames,
         )
         self._publisher_monitor = PublisherMonitor(self, self.diagnostics, self._name)
         self._participant = RequestParticipant(self, self._name) if self._name in participant_names() else None

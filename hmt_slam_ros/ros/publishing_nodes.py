@@ -30,6 +30,7 @@ from hmt_slam_ros.ros.conversions import (
 from hmt_slam_ros.ros.execution import set_realtime_priority
 from hmt_slam_ros.ros.map_publisher import MapPublisher
 from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
+from hmt_slam_ros.ros.odometry_frames import ODOM_FRAME, OdometryFrames, declare_odometry_frame
 from hmt_slam_ros.ros.parameters import declare_frame
 from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.recovery import CHECKPOINT
@@ -194,14 +195,16 @@ class RtlNode(ProcessNode):
     # Nobody waits for rtl, and dead reckoning must have no gap.
     is_always_listening = True
     changeable_parameters = ("rtl.publish_tf", "rtl.correction_time")
+    odometry_frames: OdometryFrames
 
     def declare_own_parameters(self) -> None:
         """As any process node; also declare ``map_frame`` and ``odom_frame``."""
         super().declare_own_parameters()
-        self._map_frame, self._odom_frame = declare_frame(self, "map", "map"), declare_frame(self, "odom", "odom")
+        self._map_frame, self._odom_frame = declare_frame(self, "map", "map"), declare_odometry_frame(self, ODOM_FRAME)
 
     def configure_node(self) -> None:
         """As any process node; also publish poses and transforms."""
+        self.odometry_frames = OdometryFrames(self.diagnostics, odom_frame=self._odom_frame)
         super().configure_node()
         self._hmt_poses = self.create_publisher(PoseWithCovarianceStamped, HMT_POSE, topics.STREAM)
         self._poses = self.create_publisher(PoseWithCovarianceStamped, POSE, topics.STREAM)
@@ -215,6 +218,7 @@ class RtlNode(ProcessNode):
         self._hmt_poses.publish(pose_with_covariance_message(pose.stamp, area_frame(pose.area), pose.pose_in_area))
         self._poses.publish(pose_with_covariance_message(pose.stamp, self._map_frame, pose.map_pose))
         settings = self.configuration.rtl
-        if settings.publish_tf:
+        odom_frame = self.odometry_frames.odom
+        if settings.publish_tf and odom_frame:
             map_T_odom = self._correction.smooth(pose.stamp, pose.map_T_odom, pose.odometry, settings.correction_time)
-            self._send_transforms([transform_message(pose.stamp, self._map_frame, self._odom_frame, map_T_odom)])
+            self._send_transforms([transform_message(pose.stamp, self._map_frame, odom_frame, map_T_odom)])

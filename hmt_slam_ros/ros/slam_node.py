@@ -38,6 +38,7 @@ from hmt_slam_ros.ros.initial_state import InitialState, declare_initial_pose, l
 from hmt_slam_ros.ros.laser_mountings import LaserMountings
 from hmt_slam_ros.ros.map_services import MapLoader, MapSaver, MapServicesNode, StaleSubscribers, declare_save_to
 from hmt_slam_ros.ros.message_io import subscribe_document
+from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, OdometryFrames, declare_odometry_frame
 from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_pose
 from hmt_slam_ros.ros.recovery import CHECKPOINT, ControlEvent, FrameMounting, PauseChange
 from hmt_slam_ros.ros.scan_intake import ScanIntake
@@ -91,7 +92,7 @@ class SlamNode(MapServicesNode):
         :raises HmtSlamError: for an invalid pose, or an initial pose without a map.
         """
         super().declare_own_parameters()
-        self.map_frame, self._base_frame = declare_frame(self, "map", "map"), declare_frame(self, "base", "base_link")
+        self.map_frame, self._base_frame = declare_frame(self, "map", "map"), declare_odometry_frame(self, BASE_FRAME)
         self._laser_pose, self.save_to = declare_laser_pose(self), declare_save_to(self)
         self._initial_pose = declare_initial_pose(self)
         if self._initial_pose is not None and not self.start_from:
@@ -117,11 +118,12 @@ class SlamNode(MapServicesNode):
         :raises HmtSlamError: for a map that is damaged or does not match, or that the other processes lack.
         """
         self._stale_subscribers.check_gone()
+        self.odometry_frames = OdometryFrames(self.diagnostics, base_frame=self._base_frame)
         super().configure_node()
         self._mountings = LaserMountings(
             self,
             self.diagnostics,
-            self._base_frame,
+            self.odometry_frames,
             self._laser_pose,
             self.deliver_ready_scans,
             self.recovery.record_input,

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from nav_msgs.msg import Odometry as OdometryMessage
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
@@ -36,12 +37,14 @@ from hmt_slam_ros.ros.initial_state import InitialState, declare_start_from
 from hmt_slam_ros.ros.laser_mountings import LaserMountings, check_scan_message
 from hmt_slam_ros.ros.lifecycle import ManagedNode
 from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
+from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, OdometryFrames, declare_odometry_frame
 from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_pose
 from hmt_slam_ros.ros.topics import (
     CMD_VEL,
     GOAL_POSE,
     HMT_POSE,
     INITIAL_POSE,
+    ODOM,
     PLACE,
     SCAN,
     TASK_GOALS,
@@ -77,7 +80,7 @@ class TaskNode(ManagedNode):
 
     def declare_own_parameters(self) -> None:
         """Declare frames, the laser's pose and ``start_from``."""
-        self.map_frame, self._base_frame = declare_frame(self, "map", "map"), declare_frame(self, "base", "base_link")
+        self.map_frame, self._base_frame = declare_frame(self, "map", "map"), declare_odometry_frame(self, BASE_FRAME)
         self._laser_pose = declare_laser_pose(self)
         self._start_from = declare_start_from(self)
 
@@ -111,7 +114,10 @@ class TaskNode(ManagedNode):
         self._commands = self.create_publisher(Twist, CMD_VEL, topics.STREAM) if self.is_driver else None
         self._result_publisher = self.create_publisher(String, TASK_RESULTS[self._name], topics.LATCHED)
         self._goals = self.create_publisher(PoseStamped, GOAL_POSE, topics.STREAM)
-        self._mountings = LaserMountings(self, self.diagnostics, self._base_frame, self._laser_pose)
+        frames = OdometryFrames(self.diagnostics, base_frame=self._base_frame)
+        self._mountings = LaserMountings(self, self.diagnostics, frames, self._laser_pose)
+        if Odometry not in SUBSCRIPTIONS[self._name]:
+            self.create_subscription(OdometryMessage, ODOM, frames.note, topics.NEWEST)
         self.create_subscription(PoseWithCovarianceStamped, HMT_POSE, self._on_pose, topics.NEWEST)
         self.create_subscription(LaserScan, SCAN, self._on_scan, topics.NEWEST)
         self.create_subscription(String, TASK_GOALS[self._name], self._on_task, topics.STREAM)
@@ -122,6 +128,7 @@ class TaskNode(ManagedNode):
             self.diagnostics,
             first_event=initial_state.events,
             reset_number=0,
+            odometry_frames=frames,
         )
         subscribe_document(self, ResetRequest, self._on_reset_request, topics.CHAIN)
         self.create_timer(PERIOD, self._check_chain, clock=self.diagnostics.steady_clock)
