@@ -188,7 +188,7 @@ _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
 """{node: topics that follow from no message of the process table}."""
 
 _SERVICES = {
-    "slam": ("save", "load_map", "reset", "relocalize", "pause"),
+    "slam": ("save", "load", "reset", "relocalize", "pause"),
     "tlca": ("get_map", "get_graphml"),
     "robot": ("pause",),
 }

@@ -26,13 +26,13 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry as OdometryMessage
-from nav_msgs.srv import LoadMap
 from rcl_interfaces.msg import Log, Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import ListParameters, SetParameters
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from hmt_slam_ros.messages.documents import encode
@@ -392,9 +392,18 @@ class Stranger:
 
     def set_rate(self, rate):
         """Set how fast the robot plays its log; 0 for as fast as the nodes answer."""
-        value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=rate)
-        request = SetParameters.Request(parameters=[Parameter(name="robot.rate", value=value)])
-        self.call(SetParameters, "/robot/set_parameters", request)
+        self.set_parameter("robot", "robot.rate", type=ParameterType.PARAMETER_DOUBLE, double_value=rate)
+
+    def set_parameter(self, node, name, **value):
+        """Set a parameter of a node."""
+        request = SetParameters.Request(parameters=[Parameter(name=name, value=ParameterValue(**value))])
+        self.call(SetParameters, f"/{node}/set_parameters", request)
+
+    def load_from(self, folders):
+        """Let slam load a map from each of some folders."""
+        for folder in folders:
+            self.set_parameter("slam", "load_from", type=ParameterType.PARAMETER_STRING, string_value=folder)
+            self.call(Trigger, "/slam/load", Trigger.Request())
 
     def services(self):
         """{service: type} of the nodes."""
@@ -412,8 +421,8 @@ class Stranger:
             if service[1:] in COMMANDS:
                 continue
             requests = [kind.Request()] if not service.endswith("change_state") else []
-            if kind is LoadMap:
-                requests = [LoadMap.Request(map_url=url) for url in bad_folders(folder)]
+            if service == "/slam/load":
+                self.load_from(bad_folders(folder))
             elif kind is SetParameters:
                 requests = list(self.parameter_requests(service.rpartition("/")[0]))
             else:

@@ -147,7 +147,7 @@ def test_every_topic_and_service_was_tried(run):
     assert wanted <= report["sent"].keys()
     for name in NODES:
         assert f"/{name}/set_parameters" in report["called"]
-    assert report["called"]["/slam/load_map"] > 15
+    assert report["called"]["/slam/load"] > 15
 
 
 def test_what_is_refused_is_counted_and_named_with_a_remedy(run):

@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from nav_msgs.srv import LoadMap
+from std_srvs.srv import Trigger
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
@@ -63,23 +63,23 @@ def test_a_file_a_link_and_the_folder_of_another_format_are_not_replaced(tmp_pat
             check_map_is_replaceable(tmp_path / name)
 
 
-def load(url):
-    """The answer of the service and what it warned of."""
-    warnings = []
+def refusal(load_from):
+    """The sentence by which the service refuses to load a map."""
     loader = MapLoader.__new__(MapLoader)
     loader._node = SimpleNamespace(
-        is_busy=False, configuration=Configuration(), diagnostics=SimpleNamespace(warn=warnings.append)
+        is_busy=False, configuration=Configuration(), get_parameter=lambda _: SimpleNamespace(value=str(load_from))
     )
-    response = asyncio.run(loader._load(LoadMap.Request(map_url=url), LoadMap.Response()))
-    return response.result, warnings
+    response = asyncio.run(loader._load(Trigger.Request(), Trigger.Response()))
+    assert not response.success
+    return response.message
 
 
-@pytest.mark.parametrize("url", ["n" * 5000, "file://" + "n/" * 3000, "a\nb", "/proc/self/mem", "/dev/zero"])
-def test_what_is_no_folder_cannot_be_loaded(url):
-    result, (warning,) = load(url)
-    assert result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
-    assert warning.startswith("there is no folder ")
-    assert len(warning) < 200
+@pytest.mark.parametrize("name", ["", "n" * 5000, "n/" * 3000, "a\nb", "a\0b", "/proc/self/mem", "/dev/zero"])
+def test_what_is_no_folder_cannot_be_loaded(name):
+    sentence = refusal(name)
+    assert sentence.startswith("there is no folder ")
+    assert sentence.endswith(": set load_from of slam to an output folder or hmt_map")
+    assert len(sentence) < 200
 
 
 def as_pipe(path):
@@ -101,10 +101,9 @@ def as_large_number(path):
 @pytest.mark.parametrize("make", [as_pipe, as_endless, as_deep, as_large_number])
 def test_a_folder_whose_manifest_is_none_is_refused_at_once(tmp_path, make):
     make(tmp_path / MANIFEST)
-    result, (warning,) = load(f"file://{tmp_path}")
-    assert result == LoadMap.Response.RESULT_INVALID_MAP_DATA
-    assert f"{tmp_path} is not loaded: " in warning
-    assert len(warning) < 500
+    sentence = refusal(tmp_path)
+    assert sentence.startswith(f"{tmp_path} is not loaded: ")
+    assert len(sentence) < 500
 
 
 def test_a_save_that_cannot_begin_leaves_no_temporary_folder(tmp_path, monkeypatch):

@@ -82,7 +82,7 @@ def test_every_node_has_an_enclave_and_only_a_person_requests():
     assert [name for name in rules if rules[name]["request"]] == ["operator"]
     replies = {name for node in (*node_names(), RECORDER.name) for name in rules[node]["reply"]}
     assert rules["operator"]["request"] == replies
-    assert {"/slam/save", "/slam/load_map", "/slam/change_state", "/tlca/get_map"} <= replies
+    assert {"/slam/save", "/slam/load", "/slam/change_state", "/tlca/get_map"} <= replies
 
 
 def test_who_subscribes_to_what_nobody_publishes_needs_a_driver_or_a_person():

@@ -12,7 +12,9 @@ from test_ros_localization import NODES, SCANS, Nodes
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
 from nav_msgs.msg import OccupancyGrid
-from nav_msgs.srv import GetMap, LoadMap
+from nav_msgs.srv import GetMap
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from recording import Recording
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -24,6 +26,7 @@ from hmt_slam_ros.messages.topology import Topology
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.topics import DOCUMENTS, KEYFRAMES, MAP, TFMessage
+from hmt_slam_ros.saved_map.folder import MANIFEST
 
 TRANSFORMS = {"tf", "tf_static"} if TFMessage else set()
 NAMED = {value for name, value in vars(topics).items() if name.isupper() and isinstance(value, str)}
@@ -43,8 +46,17 @@ def count_occupied(grid):
     return int((np.frombuffer(grid.data, dtype=np.int8) == 100).sum())
 
 
+def request_with(listener, service, parameter, folder):
+    """The answer of a service of slam after its parameter was set to a folder."""
+    value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=str(folder))
+    request = SetParameters.Request(parameters=[Parameter(name=parameter, value=value)])
+    (result,) = listener.call(SetParameters, "slam/set_parameters", request).results
+    assert result.successful, result.reason
+    return listener.call(Trigger, service, Trigger.Request())
+
+
 def load(listener, folder):
-    return listener.call(LoadMap, "slam/load_map", LoadMap.Request(map_url=str(folder)))
+    return request_with(listener, "slam/load", "load_from", folder)
 
 
 def last(nodes):
@@ -62,19 +74,20 @@ def test_a_map_is_loaded_while_the_nodes_run_and_the_robot_recognized_in_it(corr
     assert count_occupied(little) > 20
     nodes.until(lambda: nodes.localized)
 
-    assert load(listener, tmp_path / "nowhere").result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+    missing = load(listener, tmp_path / "nowhere")
+    assert (missing.success, missing.message[:20]) == (False, "there is no folder '")
     shutil.copytree(out / "hmt_map", tmp_path / "damaged")
     (tmp_path / "damaged" / "tlca.json").write_text("{}")
-    assert load(listener, tmp_path / "damaged").result == LoadMap.Response.RESULT_INVALID_MAP_DATA
-    nodes.until(lambda: "tlca.json is truncated or damaged" in nodes.diagnosis("slam")["last error"])
+    damaged = load(listener, tmp_path / "damaged")
+    assert not damaged.success
+    assert "tlca.json is truncated or damaged" in damaged.message
     assert nodes.is_localized()
 
     grids = listener.subscribe(OccupancyGrid, MAP, topics.LATCHED)
-    answer = load(listener, f"file://{out}")
-    assert answer.result == LoadMap.Response.RESULT_SUCCESS
-    assert count_occupied(answer.map) > 2 * count_occupied(little)
+    answer = load(listener, out)
+    assert (answer.success, answer.message) == (True, f"goes on from {out}")
     nodes.until(lambda: not nodes.is_localized())
-    nodes.until(lambda: grids and count_occupied(grids[-1]) == count_occupied(answer.map))
+    nodes.until(lambda: grids and count_occupied(grids[-1]) > 2 * count_occupied(little))
     nodes.drive(log, first=20, rate=8.0)
     nodes.until(nodes.is_localized)
     nodes.until(lambda: last(nodes).scan_index == SCANS + (SCANS - 20) - 1)
@@ -108,7 +121,10 @@ def test_after_a_reset_a_new_map_begins_where_the_robot_is_and_all_messages_can_
     # In the frame of the first scan after it.
     nodes.until_at(4 * 79, se2.between(4 * 40 * PACE, 4 * 79 * PACE), tolerance=0.3)
     assert count_occupied(listener.call(GetMap, "tlca/get_map", GetMap.Request()).map) > 20
-    assert listener.call(Trigger, "slam/save", Trigger.Request()).success
+    assert listener.call(Trigger, "slam/save", Trigger.Request()).message == f"saved to {tmp_path / 'saved'}"
+    other = request_with(listener, "slam/save", "save_to", tmp_path / "other" / "map")
+    assert (other.success, other.message) == (True, f"saved to {tmp_path / 'other' / 'map'}")
+    assert (tmp_path / "other" / "map" / MANIFEST).exists()
     nodes.until(lambda: set(recording.counts) >= SAID)
     recording.close()
     assert_documented(recording.offered)

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from nav_msgs.srv import LoadMap
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
@@ -29,7 +28,6 @@ from hmt_slam_ros.process_table import COORDINATOR, participant_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.initial_state import InitialState
-from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
 from hmt_slam_ros.ros.message_io import subscribe_document
 from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.topics import DOCUMENTS
@@ -48,20 +46,19 @@ _DISCOVERY_TIMEOUT = 5.0
 _UNSUBSCRIBE_TIMEOUT = 2.0
 """Time until DDS reports that a subscription is gone, s."""
 _POLL = 0.02  # s
+SAVE_TO, LOAD_FROM = "save_to", "load_from"
+"""Parameters that name the folders of a save and of a load; they may change while slam runs."""
 _REMEDY = "the map of before stays; make room, or set save_to of slam to another folder"
-_FILE_SCHEME = "file://"
 
 
 class MapServicesNode(ProcessNode):
     """The node ``slam``, as far as the services need it.
 
-    :ivar save_to: folder into which maps are saved.
     :ivar map_frame: name of the map's frame.
     :ivar estimate: the last estimate of metric SLAM, None before the first.
     """
 
     process: SpeculativeSlam
-    save_to: Path
     map_frame: str
     estimate: LocalEstimate | None
 
@@ -92,15 +89,13 @@ class RequestCoordinator(ABC):
         on_release: Callable[[], None],
         request_type: type[SaveRequest | ResetRequest],
         response_type: type[SaveResponse | ResetResponse],
-        failure: str,
     ) -> None:
         """Make publisher, subscription and timer.
 
         :param on_release: called when slam may handle messages again.
-        :param failure: what cannot be done, the start of each sentence about a fault.
         """
         self.is_blocking = False
-        self._node, self._on_release, self._failure = node, on_release, failure
+        self._node, self._on_release = node, on_release
         self._outcome: Future | None = None
         self._requested_at, self._number = 0.0, 0
         self._responses: dict[str, SaveResponse | ResetResponse] = {}
@@ -108,6 +103,11 @@ class RequestCoordinator(ABC):
         # A process that just started may have answered before DDS has made this reader known to it.
         subscribe_document(node, response_type, self._on_response, topics.CHAIN)
         node.create_timer(PERIOD, self._check_timeout, clock=node.diagnostics.steady_clock)
+
+    @property
+    @abstractmethod
+    def _failure(self) -> str:
+        """What cannot be done, the start of each sentence about a fault."""
 
     @property
     def is_busy(self) -> bool:
@@ -248,12 +248,21 @@ class MapSaver(RequestCoordinator):
 
     def __init__(self, node: MapServicesNode, on_release: Callable[[], None]) -> None:
         """Offer the service."""
-        self._target = node.save_to
-        super().__init__(node, on_release, SaveRequest, SaveResponse, f"{self._target} cannot be saved")
+        self._target = _folder_of(node, SAVE_TO)
+        super().__init__(node, on_release, SaveRequest, SaveResponse)
         self._final_save: Future | None = None
         self._is_shutting_down = False
         self._pending_save: _PendingSave | None = None
         self._offer(Trigger, "~/save", self._save)
+
+    @property
+    def _failure(self) -> str:
+        return f"{self._target} cannot be saved"
+
+    def request(self) -> Future:
+        """As any request; into the folder that the parameter names by now."""
+        self._target = _folder_of(self._node, SAVE_TO)
+        return super().request()
 
     async def _save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._node.is_busy:
@@ -312,30 +321,40 @@ class MapSaver(RequestCoordinator):
         self._pending_save = None
 
 
-def declare_save_to(node: Node) -> Path:
-    """Declare ``save_to``, and return the folder for the map."""
-    descriptor = ParameterDescriptor(description="Folder into which the service save writes the map.", read_only=True)
-    return Path(node.declare_parameter("save_to", HMT_MAP, descriptor).value).absolute()
+def declare_folders(node: Node) -> None:
+    """Declare the parameters of the folders that the services read at each request."""
+    for name, default, description in (
+        (SAVE_TO, HMT_MAP, "Folder into which the service save writes the map."),
+        (LOAD_FROM, "", "Output folder or hmt_map from which the service load goes on."),
+    ):
+        node.declare_parameter(name, default, ParameterDescriptor(description=description))
 
 
-def folder_of_url(url: str) -> Path | None:
-    """The folder that a ``map_url`` names, None where there is none."""
-    folder = Path(url.removeprefix(_FILE_SCHEME)).absolute()
+def _folder_of(node: Node, parameter: str) -> Path:
+    """The folder that a parameter names."""
+    return Path(node.get_parameter(parameter).value).absolute()
+
+
+def _is_folder(path: Path) -> bool:
     try:
-        return folder if folder.is_dir() else None
-    except OSError:  # such as a name that is too long
-        return None
+        return path.is_dir()
+    except (OSError, ValueError):  # such as a name that is too long
+        return False
 
 
 class MapLoader(RequestCoordinator):
-    """The services ``load_map`` and ``reset``."""
+    """The services ``load`` and ``reset``."""
 
     def __init__(self, node: MapServicesNode, on_release: Callable[[], None]) -> None:
         """Offer the services."""
-        super().__init__(node, on_release, ResetRequest, ResetResponse, "the map cannot be exchanged")
+        super().__init__(node, on_release, ResetRequest, ResetResponse)
         self._folder = ""
-        self._offer(LoadMap, "~/load_map", self._load)
+        self._offer(Trigger, "~/load", self._load)
         self._offer(Trigger, "~/reset", self._reset)
+
+    @property
+    def _failure(self) -> str:
+        return "the map cannot be exchanged"
 
     async def _reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._node.is_busy:
@@ -347,42 +366,46 @@ class MapLoader(RequestCoordinator):
         response.success, response.message = await self.request()
         return response
 
-    async def _load(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
-        """Answer as nav2's map_server does, by a result code; the sentence is in the log and in /diagnostics."""
-        response.result = LoadMap.Response.RESULT_UNDEFINED_FAILURE
+    async def _load(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._node.is_busy:
-            self._node.diagnostics.warn("a map is being saved or loaded, so no other one is loaded: ask again")
-            return response
-        folder = folder_of_url(request.map_url)
-        if folder is None:
-            self._node.diagnostics.warn(
-                f"there is no folder {shorten(request.map_url)}: set map_url to an output folder or hmt_map"
-            )
-            response.result = LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+            response.message = "a map is being saved or loaded, so no other one is loaded: ask again"
             return response
         try:
-            document = self._read_checked_map(folder).map
+            folder = self._checked_folder()
         except HmtSlamError as fault:
-            self._node.diagnostics.warn(f"{folder} is not loaded: {fault}")
-            response.result = LoadMap.Response.RESULT_INVALID_MAP_DATA
+            response.message = str(fault)
             return response
         self._folder = str(folder)
-        done, _ = await self.request()
-        if done:
-            response.result = LoadMap.Response.RESULT_SUCCESS
-            state = MapRendererState.from_document(document)
-            renderer = MapRenderer(self._node.configuration, self._node.map_frame, state)
-            response.map = renderer.occupancy_grid() or response.map
+        response.success, response.message = await self.request()
         return response
 
-    def _read_checked_map(self, folder: Path) -> InitialState:
-        """A map whose parts can all be read, so that either all processes start with it or none does."""
+    def _checked_folder(self) -> Path:
+        """The folder of ``load_from``, whose map can be loaded.
+
+        :raises HmtSlamError: where it cannot.
+        """
+        name = str(self._node.get_parameter(LOAD_FROM).value)
+        folder = _folder_of(self._node, LOAD_FROM)
+        if not name or not _is_folder(folder):
+            raise HmtSlamError(
+                f"there is no folder {shorten(repr(name))}: set load_from of slam to an output folder or hmt_map"
+            )
+        try:
+            self._check_map(folder)
+        except HmtSlamError as fault:
+            raise HmtSlamError(f"{folder} is not loaded: {fault}") from fault
+        return folder
+
+    def _check_map(self, folder: Path) -> None:
+        """Check that all parts of a map can be read, so that either all processes start with it or none does.
+
+        :raises HmtSlamError: where one cannot.
+        """
         from hmt_slam_ros.results.hmt_map import PARTS  # noqa: PLC0415  only for a load
 
         initial_state = InitialState(self._node, str(folder), lost=True)
         parts = {name: initial_state.read_part(name, PARTS[name]) for name in (COORDINATOR, *participant_names())}
         check_process_states(parts, self._node.configuration)
-        return initial_state
 
     def _make_request(self, number: int, events: int) -> ResetRequest:
         return ResetRequest(number, events, self._folder)

@@ -21,6 +21,7 @@ _NODE_PARAMETERS = (
     *("base_frame", "odom_frame", "map_frame", "team_frame", "laser_frame", "laser_pose"),
     "log",
     "save_to",
+    "load_from",
     "save_on_shutdown",
     "start_from",
     "start_lost",

@@ -36,7 +36,7 @@ from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.initial_state import InitialState, declare_initial_pose, locate_in_map
 from hmt_slam_ros.ros.laser_mountings import LaserMountings
-from hmt_slam_ros.ros.map_services import MapLoader, MapSaver, MapServicesNode, StaleSubscribers, declare_save_to
+from hmt_slam_ros.ros.map_services import MapLoader, MapSaver, MapServicesNode, StaleSubscribers, declare_folders
 from hmt_slam_ros.ros.message_io import subscribe_document
 from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, OdometryFrames, declare_odometry_frame
 from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_pose
@@ -87,13 +87,14 @@ class SlamNode(MapServicesNode):
         self._stale_subscribers = StaleSubscribers(self)
 
     def declare_own_parameters(self) -> None:
-        """As any process node; also declare frames, laser pose, ``save_to`` and ``initial_pose``.
+        """As any process node; also declare frames, laser pose, folders of maps and ``initial_pose``.
 
         :raises HmtSlamError: for an invalid pose, or an initial pose without a map.
         """
         super().declare_own_parameters()
         self.map_frame, self._base_frame = declare_frame(self, "map", "map"), declare_odometry_frame(self, BASE_FRAME)
-        self._laser_pose, self.save_to = declare_laser_pose(self), declare_save_to(self)
+        self._laser_pose = declare_laser_pose(self)
+        declare_folders(self)
         self._initial_pose = declare_initial_pose(self)
         if self._initial_pose is not None and not self.start_from:
             raise HmtSlamError("initial_pose is set, but no map that it is a pose in: set start_from, or leave it away")
@@ -236,7 +237,7 @@ class SlamNode(MapServicesNode):
         if self.is_recovering:
             return
         if not self.process.is_mapping and self.initial_state.map is None:
-            self.diagnostics.warn("mode = localization, but there is no map: call load_map, or set start_from or mode")
+            self.diagnostics.warn("mode = localization, but there is no map: call slam/load, or set start_from or mode")
         if self._initial_pose is not None:
             self.deliver(PoseReset(self._locate_in_map(self._initial_pose)))
         elif self.initial_state.lost:
