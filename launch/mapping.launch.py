@@ -7,7 +7,7 @@ from launch.substitutions import LaunchConfiguration, LaunchLogDir, PathJoinSubs
 from launch_ros.actions import Node
 
 from hmt_slam_ros.process_table import ALL, TEAM, process_names
-from hmt_slam_ros.ros.launch_actions import PACKAGE, RESPAWN, common_arguments, node, switch, value
+from hmt_slam_ros.ros.launch_actions import PACKAGE, RESPAWN, common_arguments, node, switch, topic_remappings, value
 
 PARAMETERS = {
     "use_sim_time": bool,
@@ -29,7 +29,6 @@ def _arguments() -> list[DeclareLaunchArgument]:
     modes = ["", "mapping", "localization", "lifelong"]
     texts = {
         "start_from": ("", "Saved map to go on from; empty for none."),
-        "save_to": ("hmt_map", "Folder for the service slam/save."),
         "view_port": ("8800", "Port of the live page on 127.0.0.1."),
         "recovery": (
             PathJoinSubstitution([LaunchLogDir(), "recovery"]),
@@ -55,7 +54,7 @@ def _arguments() -> list[DeclareLaunchArgument]:
     ]
 
 
-def _processes(context: LaunchContext) -> list[Node]:
+def _processes(context: LaunchContext) -> list[OpaqueFunction]:
     parameters = {name: value(name, kind) for name, kind in PARAMETERS.items()}
     mode = LaunchConfiguration("mode").perform(context)
     is_one_program = LaunchConfiguration("one_program").perform(context) == "true"
@@ -74,6 +73,7 @@ def _view() -> Node:
         executable="view",
         namespace=LaunchConfiguration("namespace"),
         parameters=[{"port": value("view_port", int), "system": value("system", str)}],
+        remappings=topic_remappings(),
         output="screen",
         condition=IfCondition(LaunchConfiguration("view")),
         **RESPAWN,

@@ -199,7 +199,9 @@ def test_launch_file_describes_its_arguments(path):
     namespace = {}
     exec(compile(path.read_text(), str(path), "exec"), namespace)
     described = {argument.name for argument in namespace["generate_launch_description"]().get_launch_arguments()}
-    assert {"params_file", "namespace"} <= described
+    topics = {"scan_topic", "odom_topic", "clock_topic"}
+    frames = {"map_frame", "odom_frame", "base_frame"}
+    assert {"params_file", "namespace", "save_to", *topics, *frames} <= described
 
 
 def topics_of_the_nodes():

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from launch import LaunchContext, Substitution
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, LaunchLogDir, PathJoinSubstitution
 from launch_ros.actions import Node
@@ -17,6 +17,17 @@ from launch_ros.substitutions import FindPackageShare
 PACKAGE = "hmt_slam_ros"
 RESPAWN = {"respawn": True, "respawn_delay": 1.0, "respawn_max_retries": 3}
 """Options of a node that is started again where it was killed."""
+FRAMES = {
+    "map_frame": "Frame of the map; empty for what the YAML file says, else map.",
+    "odom_frame": "Frame of the odometry; empty for what the YAML file says, else that of its messages.",
+    "base_frame": "Frame of the robot; empty for what the YAML file says, else that of the odometry's messages.",
+}
+TOPICS = {
+    "scan_topic": ("scan", "Topic of the scans."),
+    "odom_topic": ("odom", "Topic of the odometry."),
+    "clock_topic": ("/clock", "Topic of the time, for use_sim_time."),
+}
+"""{argument: topic that is remapped, and description}."""
 
 
 class LaunchName(Substitution):
@@ -51,6 +62,9 @@ def common_arguments() -> list[DeclareLaunchArgument]:
             default_value=LaunchName(),
             description="Name of the system, of which the nodes take messages; by default another one for each launch.",
         ),
+        DeclareLaunchArgument("save_to", default_value="hmt_map", description="Folder for the service slam/save."),
+        *(DeclareLaunchArgument(name, default_value=topic, description=text) for name, (topic, text) in TOPICS.items()),
+        *(DeclareLaunchArgument(name, default_value="", description=text) for name, text in FRAMES.items()),
         switch("view", "false", "Whether the live page is served."),
     ]
 
@@ -70,19 +84,33 @@ def value(name: str, kind: type) -> ParameterValue:
     return ParameterValue(LaunchConfiguration(name), value_type=kind)
 
 
-def node(executable: str, parameters: dict[str, Any], **options: Any) -> Node:  # noqa: ANN401  of launch_ros
-    """Node of this package, with the parameter file, the name of the system and further parameters."""
-    return Node(
-        package=PACKAGE,
-        executable=executable,
-        namespace=LaunchConfiguration("namespace"),
-        parameters=[LaunchConfiguration("params_file"), {"system": value("system", str), **parameters}],
-        output="screen",
-        **options,
-    )
+def node(executable: str, parameters: dict[str, Any], **options: Any) -> OpaqueFunction:  # noqa: ANN401  of launch_ros
+    """Node of this package, with the parameter file, topics, frames, the name of the system and further parameters."""
+
+    def make(context: LaunchContext) -> list[Node]:
+        frames = {name: value(name, str) for name in FRAMES if LaunchConfiguration(name).perform(context)}
+        named = {"system": value("system", str), **frames, **parameters}
+        return [
+            Node(
+                package=PACKAGE,
+                executable=executable,
+                namespace=LaunchConfiguration("namespace"),
+                parameters=[LaunchConfiguration("params_file"), named],
+                remappings=topic_remappings(),
+                output="screen",
+                **options,
+            )
+        ]
+
+    return OpaqueFunction(function=make)
 
 
-def robot(log: str, **parameters: str) -> Node:
+def topic_remappings() -> list[tuple[str, LaunchConfiguration]]:
+    """Remappings of the topics that the arguments name."""
+    return [(topic, LaunchConfiguration(name)) for name, (topic, _) in TOPICS.items()]
+
+
+def robot(log: str, **parameters: str) -> OpaqueFunction:
     """The robot node, which publishes /clock and so runs on the computer's own clock.
 
     :param log: name of the argument with the log or world.

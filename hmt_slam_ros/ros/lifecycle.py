@@ -270,7 +270,7 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         ):
             for entity in set(entities) - self._permanent_entities:
                 # rclpy makes it when use_sim_time is set.
-                if getattr(entity, "topic_name", "") != CLOCK_TOPIC:
+                if getattr(entity, "topic_name", "") != self.resolve_topic_name(CLOCK_TOPIC):
                     destroy(entity)
 
 
