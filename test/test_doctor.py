@@ -460,3 +460,9 @@ def test_nodes_that_compile_their_kernels_are_no_fault_of_a_running_system():
     findings = list(running_findings(running))
     assert {finding.severity for finding in findings} <= {"fine"}
     assert any(f"/slam: {text}; " in finding.text for finding in findings)
+    waiting = replace(running, topics=defaultdict(lambda: Topic(0, ("robot",))))
+    findings = list(running_findings(waiting))
+    assert {finding.severity for finding in findings} == {"fine"}
+    assert "robot sends nothing on scan until the kernels are compiled." in [finding.text for finding in findings]
+    driven = replace(running, topics=defaultdict(lambda: Topic(0, ("driver",))))
+    assert "wrong" in {finding.severity for finding in running_findings(driven)}

@@ -12,7 +12,7 @@ from logs_for_nodes import LASER, START, Corridor, corridor_bag
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, TransformStamped, Twist
 from nav_msgs.msg import Odometry as OdometryMessage
 from rosgraph_msgs.msg import Clock
@@ -167,6 +167,28 @@ def test_the_robot_waits_for_those_who_subscribe_to_it_and_answer(tmp_path, list
     assert "too few subscribers of scan after 3 s" in error
     assert "robot.scan_listeners" in error
     assert "Traceback" not in error
+
+
+def test_the_robot_waits_for_nodes_that_compile_their_kernels(tmp_path, listener, start, received_topics):
+    reports = listener.node.create_publisher(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    kernels = "compiling kernels, 40 s left"
+
+    def report():
+        value = KeyValue(key="kernels", value=kernels)
+        reports.publish(
+            DiagnosticArray(status=[DiagnosticStatus(name="/tlca", hardware_id="hmt_slam_ros", values=[value])])
+        )
+
+    listener.node.create_timer(0.1, report)
+    parameters = {"robot__flow_control": False, "robot__scan_listeners": 2, "robot__odometry_listeners": 0}
+    robot = start("robot", log=corridor_bag(tmp_path, 3), robot__rate=0.0, **parameters)
+    listener.until(reports.get_subscription_count, alive=[robot])
+    listener.spin(1.0)
+    listener.subscribe(LaserScan, "scan", topics.SENSOR)
+    listener.spin(1.5)
+    assert last_status(received_topics)["state"] == "waiting"
+    kernels = "63 loaded"
+    listener.until(has_ended(received_topics), alive=[robot])
 
 
 def test_a_log_that_loops_goes_on_from_the_start_with_later_stamps(tmp_path, listener, start, received_topics):

@@ -13,6 +13,9 @@ from hmt_slam_ros.process_table import COORDINATOR, process_names, topic_of
 OUR_NODES = process_names()
 """Nodes without which there is no mapping."""
 
+_ROBOT = "robot"
+"""Node that replays a log or simulates a robot, and waits for the others."""
+
 SCAN, ODOM, TF, TF_STATIC, CLOCK = "scan", "odom", "tf", "tf_static", "/clock"
 ESTIMATES = topic_of("LocalEstimate")
 SINGLE_PUBLISHER_TOPICS = (SCAN, ODOM, "map", "pose", CLOCK)
@@ -187,7 +190,11 @@ def _check_silence(running: RunningSystem, *, all_active: bool) -> Iterator[Find
     for name in (SCAN, ODOM):
         topic = running.topics[name]
         by_transform = name == ODOM and running.topics[TF].message_count
-        if not topic.message_count and not by_transform:
+        if topic.message_count or by_transform:
+            continue
+        if set(topic.publishers) == {_ROBOT} and any(map(_is_compiling, running.diagnostics)):
+            yield Finding("fine", f"{name} silent", f"{_ROBOT} sends nothing on {name} until the kernels are compiled.")
+        else:
             yield Finding("wrong", f"{name} silent", _silence_text(name, topic, running.seconds))
     if running.missing_laser_transform:
         yield Finding("wrong", "laser transform", running.missing_laser_transform)

@@ -28,6 +28,7 @@ from std_srvs.srv import SetBool
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.robot import RobotParameters
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.kernel_loading import COMPILING
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
@@ -65,6 +66,8 @@ _BURST = 20
 """Measurements that are sent between two such checks."""
 _ACKNOWLEDGEMENT_TIMEOUT = 10.0
 """Time without an acknowledgement after which that is reported, s."""
+_COMPILING_MEMORY = 3.0
+"""Time for which a node is assumed to compile after its last diagnostics that report so, s; they come once a second."""
 _MAX_VELOCITY = 100.0
 """Magnitude of a velocity command, m/s and rad/s, beyond any robot's."""
 _REPEAT_PERIOD = 10.0
@@ -154,6 +157,7 @@ class RobotNode(ConfiguredNode):
         self._state: PlaybackState = "waiting"
         self._laser_frames: dict[bytes, tuple[str, NDArray[np.float64]]] = {}
         self._started_at = self._last_progress = time.monotonic()
+        self._compiling_at = -_COMPILING_MEMORY
         self._scans = self.create_publisher(LaserScan, SCAN, topics.LATCHED_SENSOR)
         self._readings = self.create_publisher(OdometryMessage, ODOM, topics.LATCHED_SENSOR)
         self._clock_times = self.create_publisher(ClockMessage, CLOCK, topics.STREAM)
@@ -167,11 +171,18 @@ class RobotNode(ConfiguredNode):
         self.create_timer(_STATUS_PERIOD, self._publish_status, clock=self.diagnostics.steady_clock)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        """Wait for nodes that load or compile their kernels as long as they do."""
+        """Wait for nodes that load their kernels for longer, and for those that compile them as long as they do."""
         for status in message.status:
             for value in status.values if status.hardware_id == HARDWARE_ID else ():
                 if value.key == KERNELS and value.value.startswith(LOADING):
                     self._started_at = time.monotonic()
+                    if value.value.startswith(COMPILING):
+                        self._compiling_at = self._started_at
+
+    @property
+    def _is_awaiting_kernels(self) -> bool:
+        """Whether a node compiles its kernels."""
+        return time.monotonic() - self._compiling_at < _COMPILING_MEMORY
 
     def _open_log(self) -> Log:
         descriptor = ParameterDescriptor(description="The log to replay, or sim:WORLD.", read_only=True)
@@ -244,7 +255,7 @@ class RobotNode(ConfiguredNode):
         ]
         if settings.flow_control and settings.scan_listeners and not missing and not self._is_answered:
             missing = [SCAN]
-        if not missing:
+        if not missing and not self._is_awaiting_kernels:
             self._state, self._last_progress = "playing", time.monotonic()
             if self._driven_robot is None:
                 sentence = f"replaying {self._log.name}: {self._log.scan_count} scans"
@@ -252,7 +263,7 @@ class RobotNode(ConfiguredNode):
                 sentence = f"driving through {self._log.name} by cmd_vel"
             self.get_logger().info(sentence)
             return
-        if time.monotonic() - self._started_at > settings.discovery_timeout:
+        if missing and time.monotonic() - self._started_at > settings.discovery_timeout:
             name = "scan" if missing[0] == SCAN else "odometry"
             raise HmtSlamError(
                 f"too few subscribers of {' and '.join(missing)} after {settings.discovery_timeout:g} s: start the "
@@ -321,6 +332,8 @@ class RobotNode(ConfiguredNode):
             player.scans_acknowledged,
         )
         self._statuses.publish(String(data=encode(status, system=self.system.name)))
+        if self._is_awaiting_kernels:
+            self._last_progress = time.monotonic()
         if (
             self._state == "playing"
             and player.is_held_up
