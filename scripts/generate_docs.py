@@ -164,12 +164,13 @@ _FURTHER_PUBLISHED: dict[str, tuple[str, ...]] = {
     "robot": ("scan", "odom", "/clock", "hmt/robot_status", "tf", "tf_static", "ground_truth"),
     "explorer": _TASK_TOPICS,
     "pilot": (*_TASK_TOPICS, "pilot/place_estimate", "initialpose"),
+    "view": ("hmt/incidents",),
     "operator": ("initialpose", "rendezvous", "explorer/task", "pilot/task"),
 }
 """{node: topics that follow from no message of the process table}."""
 
 _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
-    "slam": (*_RESPONSES, "tf_static"),
+    "slam": (*_RESPONSES, "tf_static", "diagnostics"),
     "view": (
         *("pose", "hmt/pose", "hmt/graph", "map", "hmt/keyframes", "hmt/hypotheses", "hmt/is_localized"),
         *("hmt/entropy", "hmt/robot_status", "diagnostics", "/team/placements"),
@@ -180,8 +181,8 @@ _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
     "pilot": ("hmt/reset_request", "tf_static"),
     "recorder": ("hmt/area_events", "hmt/robot_status", "diagnostics", "hmt/cost"),
     "operator": (
-        *("map", "pose", "hmt/pose", "hmt/graph", "hmt/particles", "diagnostics", "hmt/notices", "scan", "tf"),
-        *("tf_static", "explorer/task_result", "pilot/task_result", "pilot/place_estimate"),
+        *("map", "pose", "hmt/pose", "hmt/graph", "hmt/particles", "diagnostics", "hmt/incidents", "hmt/notices"),
+        *("scan", "tf", "tf_static", "explorer/task_result", "pilot/task_result", "pilot/place_estimate"),
         *("hmt/ambiguity", "hmt/ambiguity_goal", "hmt/path", "hmt/topology"),
     ),
 }
@@ -218,7 +219,7 @@ def _services(row: NodeRow) -> tuple[str, ...]:
 
 def _publications(row: NodeRow) -> Iterator[str]:
     """Topics that a node publishes."""
-    yield from ("/rosout", "/parameter_events", "diagnostics", "hmt/cost")
+    yield from ("/rosout", "/parameter_events", "diagnostics", "/diagnostics", "hmt/cost")
     if _is_managed(row):
         yield "~/transition_event"
     if isinstance(row, ProcessRow):

@@ -9,6 +9,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Odometry as OdometryMessage
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -88,6 +90,44 @@ def test_what_is_silent_missing_or_does_not_fit_is_reported(listener, doctor):
     ):
         assert any(text.startswith(begin) for text in wrong), (begin, wrong)
     assert len(wrong) == 6, wrong
+
+
+def test_frames_that_contradict_and_two_systems_are_reported(listener, doctor):
+    odom_frame = Parameter("odom_frame", value="odom")
+    one = Node("rtl", context=listener.context, parameter_overrides=[odom_frame])
+    one.declare_parameter("odom_frame", "")
+    other = Node("rtl", context=listener.context)
+    odometry = one.create_publisher(OdometryMessage, "odom", 10)
+    reports = one.create_publisher(DiagnosticArray, "diagnostics", 10)
+
+    def publish():
+        now = time.time_ns()
+        odometry.publish(conversions.odometry_message(Odometry(now, np.zeros(3)), "wheel_odom", "base_link"))
+        for system in ("one", "two"):
+            values = [KeyValue(key="system", value=system)]
+            reports.publish(
+                DiagnosticArray(status=[DiagnosticStatus(name="/rtl", hardware_id="hmt_slam_ros", values=values)])
+            )
+            values = [KeyValue(key="system", value="three")]
+            reports.publish(
+                DiagnosticArray(status=[DiagnosticStatus(name="/a/rtl", hardware_id="hmt_slam_ros", values=values)])
+            )
+
+    for node in (one, other):
+        listener.executor.add_node(node)
+    _, findings = doctor(2.0, meanwhile=publish)
+    for node in (one, other):
+        listener.executor.remove_node(node)
+        node.destroy_node()
+    wrong = texts(findings, "wrong")
+    assert (
+        "frames contradict: /rtl has odom_frame = odom, and the odometry is that of wheel_odom, so that the tree of "
+        "transforms is in two parts: leave odom_frame empty, or set it to wheel_odom."
+    ) in wrong
+    assert (
+        "two systems: 2 systems run in this namespace, one and two: end all but one, or give each system a namespace "
+        "or a ROS_DOMAIN_ID of its own."
+    ) in wrong
 
 
 def test_nodes_in_another_namespace_are_not_taken_for_those_of_this_one(listener, doctor):

@@ -406,7 +406,7 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
         ("two/odom", "two/base_link"),
         ("two/base_link", "two/laser"),
     }
-    shared = {"/clock", "/parameter_events", "/rosout", "/tf", "/tf_static"}
+    shared = {"/clock", "/diagnostics", "/parameter_events", "/rosout", "/tf", "/tf_static"}
     for name, _ in listener.node.get_topic_names_and_types():
         assert name in shared or name.startswith(("/one/", "/two/")), name
     for name, _ in listener.node.get_service_names_and_types():

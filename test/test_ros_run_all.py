@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 from pathlib import Path
 
@@ -39,6 +40,8 @@ def test_a_node_that_is_killed_is_forked_again_and_the_map_is_whole(corridor, li
     nodes = ForkedNodes(start, listener, recovery=tmp_path / "recovery")
     nodes.drive(corridor[0], 0)
     nodes.until(lambda: len(nodes.estimates) >= SCANS // 3)
+    system = f"{socket.gethostname()}-{nodes.program.pid}"
+    nodes.until(lambda: nodes.diagnosis("tsbi")["system"] == system)
     before = nodes.pids()
     assert set(before) == {f"hmt_slam_{name}" for name in NODES}
     assert all(shared_bytes(pid) > 20e6 for pid in before.values())

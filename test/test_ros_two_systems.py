@@ -101,6 +101,25 @@ def test_both_go_on_and_report_each_other_on_diagnostics_and_on_the_page(listene
             assert int(values_of(reports, system, node)["refused on odom"]) > 0
 
 
+@pytest.mark.parametrize(("one", "two"), [("one", "two"), ("", ""), ("same", "same")])
+def test_a_launch_that_was_left_running_and_a_second_one_name_each_other_at_once(listener, start, one, two):
+    reports = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    nodes = [start("slam", *(["-p", f"system:={name}"] if name else [])) for name in (one, two)]
+
+    def others():
+        """{start of a node: the system that it reports}, of those that warn of it."""
+        found = {}
+        for report in reports:
+            status = report.status[0]
+            values = {each.key: each.value for each in status.values}
+            if status.message.startswith(f"a second system runs here, {values.get('second system')}: give each"):
+                found[values["started at"]] = values["second system"]
+        return found
+
+    listener.until(lambda: len(others()) == 2, alive=nodes)
+    assert set(others().values()) == ({one, two} if one else {"without a name"})
+
+
 def test_systems_without_names_are_detected_by_their_publishers(listener, start):
     reports = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     nodes = [start("rtl"), start("rtl")]

@@ -306,15 +306,15 @@ def test_nodes_that_compile_are_no_alarm_and_the_longest_time_left_is_shown():
     assert health.verdict(1.0)["text"] == "slam: compiling kernels, 12 s left."
 
 
-def test_errors_come_before_warnings_and_warnings_grow_old():
+def test_errors_come_before_warnings_which_end_with_the_level_of_the_node():
     health = SystemHealth(NODES, last_pose_at=100.0, is_localized=False)
     well(health, 0.0, slam=(1, "the wheels slip"))
     assert health.verdict(1.0) == {"level": "attention", "text": "slam warns.", "advice": "the wheels slip"}
-    well(health, 99.0, slam=(1, "the wheels slip"))
+    well(health, 99.0)
     assert health.rows(100.0)[0] | {"values": 0} == {
         "name": "slam",
         "level": "good",
-        "message": "the wheels slip",
+        "message": "running",
         "values": 0,
         "load": 0.25,
     }

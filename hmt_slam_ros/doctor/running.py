@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from hmt_slam_ros.doctor.finding import Finding, Severity, times_text
 from hmt_slam_ros.kernel_loading import COMPILING
+from hmt_slam_ros.messages.system_name import REMEDY
 from hmt_slam_ros.process_table import COORDINATOR, process_names, topic_of
 
 OUR_NODES = process_names()
@@ -105,6 +106,7 @@ class RunningSystem:
     :ivar missing_laser_transform: sentence about a missing transform of the laser, empty where none is missing.
     :ivar other_namespaces: other namespaces with nodes of ours.
     :ivar frame_contradictions: parameters of nodes that name other frames than the odometry.
+    :ivar systems: names of the systems of our nodes in the doctor's namespace.
     """
 
     seconds: float
@@ -117,6 +119,7 @@ class RunningSystem:
     missing_laser_transform: str
     other_namespaces: tuple[str, ...] = ()
     frame_contradictions: tuple[FrameContradiction, ...] = ()
+    systems: tuple[str, ...] = ()
 
 
 def running_findings(running: RunningSystem) -> Iterator[Finding]:
@@ -124,6 +127,7 @@ def running_findings(running: RunningSystem) -> Iterator[Finding]:
     states = list(_check_states(running))
     yield from _check_nodes(running, all_active=not states)
     yield from states
+    yield from _check_systems(running)
     yield from _check_silence(running, all_active=not states)
     yield from _check_qos(running)
     yield from _check_publishers(running)
@@ -156,6 +160,21 @@ def _check_nodes(running: RunningSystem, *, all_active: bool) -> Iterator[Findin
         yield Finding("wrong", "nodes", text)
     elif all_active:
         yield Finding("fine", "nodes", f"All nodes run: {_join_names(present)}.")
+
+
+def _check_systems(running: RunningSystem) -> Iterator[Finding]:
+    """A finding on two systems that speak on the same topics."""
+    doubled = sorted({name for name in OUR_NODES if running.nodes.count(name) > 1})
+    if len(running.systems) > 1:
+        text = f"{len(running.systems)} systems run in this namespace, {_join_names(running.systems)}"
+    elif doubled:
+        text = (
+            f"{_join_names(doubled)} {'runs' if len(doubled) == 1 else 'run'} twice in this namespace (a killed node "
+            "counts for 20 s)"
+        )
+    else:
+        return
+    yield Finding("wrong", "two systems", f"{text}: end all but one, or {REMEDY}.")
 
 
 def _check_states(running: RunningSystem) -> Iterator[Finding]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
+from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
@@ -15,17 +18,19 @@ from std_msgs.msg import Float64MultiArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.messages import Keyframe, LocalEstimate, Message
-from hmt_slam_ros.messages.system_name import SystemName
+from hmt_slam_ros.messages.system_name import REMEDY, SystemName
 from hmt_slam_ros.process_memory import current_rss, peak_rss
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import cost_message
-from hmt_slam_ros.ros.topics import COST, DIAGNOSTICS
+from hmt_slam_ros.ros.topics import AGGREGATED, COST, DIAGNOSTICS
 from hmt_slam_ros.untrusted_input import shorten
 
 PERIOD = 1.0
 """Time between two messages on /diagnostics, s."""
 STATE, ACTIVE = "state", "active"
 """Key of the lifecycle state in /diagnostics, and its value for an active node."""
+STARTED = "started at"
+"""Key of the time at which a node started, by which two nodes of one name differ."""
 SYSTEM, SECOND_SYSTEM = "system", "second system"
 """Keys of the name of a node's system in /diagnostics, and of another system that speaks on its topics."""
 KERNELS = "kernels"
@@ -34,12 +39,21 @@ LOADING = ("compiling", "loading")
 """Beginnings of that value before the kernels are loaded."""
 HARDWARE_ID = "hmt_slam_ros"
 """Name in /diagnostics by which the nodes of the package are known."""
+WARNING_LIFETIME = 60.0
+"""Time for which a warning holds after it was last given, s; ``last error`` keeps it."""
 _MAX_CAUSES = 20
 """Different causes of refusals on a topic that are logged; more are only counted."""
 _MAX_SENTENCE = 400
 """Characters of a refusal, whatever a message holds."""
 _CAUSE = re.compile(r"[^=(\d'\[]*")
 """The beginning of a sentence, up to the first value in it."""
+
+
+class _Fault(NamedTuple):
+    """A warning or an error, and until when it holds by the monotonic clock, s."""
+
+    sentence: str
+    until: float
 
 
 class NodeDiagnostics:
@@ -51,17 +65,20 @@ class NodeDiagnostics:
     :ivar kernels: describes the kernels of the node for an entry; empty for none.
     :ivar progress: describes what has to be done before the node can process messages; empty without.
     :ivar system: the system that the node belongs to.
+    :ivar started: time at which the node started, in ISO 8601.
     :ivar crowded_topic: a topic with more publishers than one system has, and their number; empty without.
     :ivar steady_clock: clock for timers that run while simulated time stands still.
     """
 
     def __init__(self, node: Node, system: SystemName) -> None:
         self._node, self.system, self.crowded_topic = node, system, ""
+        self.started = datetime.now(UTC).isoformat(timespec="milliseconds")
         self.kernels: Callable[[], str] = str
         self.progress: Callable[[], str] = str
         self.clear()
         self._clock = Clock(clock_type=ClockType.SYSTEM_TIME)
-        self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+        names = {node.resolve_topic_name(name): None for name in (DIAGNOSTICS, AGGREGATED)}
+        self._publishers = [node.create_publisher(DiagnosticArray, name, topics.STREAM) for name in names]
         self._cost = node.create_publisher(Float64MultiArray, COST, topics.COST_HISTORY)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(PERIOD, self.publish, clock=self.steady_clock)
@@ -73,8 +90,8 @@ class NodeDiagnostics:
         self.values: dict[str, object] = {}
         self._refused: Counter[str] = Counter()
         self._causes: defaultdict[str, set[str]] = defaultdict(set)
-        self._error = ""
-        self._level = DiagnosticStatus.OK
+        self._error, self._error_at = "", ""
+        self._faults: dict[bytes, _Fault] = {}
         self._last_stamp = 0
         self._previous_counts: dict[str, int] = {}
         self._previous_counts_at = time.monotonic()
@@ -83,7 +100,7 @@ class NodeDiagnostics:
 
     def warn(self, sentence: str) -> None:
         """Record and log a fault that the node survives; a repeated sentence is logged once."""
-        self._record_fault(sentence, DiagnosticStatus.WARN)
+        self._record_fault(sentence, DiagnosticStatus.WARN, WARNING_LIFETIME)
 
     def refuse(self, topic: str, fault: HmtSlamError) -> None:
         """Count a message that is left out, and log the first one of each cause.
@@ -109,17 +126,22 @@ class NodeDiagnostics:
         self._refused[topic] += count
         self.values[f"refused on {topic}"] = self._refused[topic]
 
-    def fail(self, sentence: str) -> None:
-        """Record and log a fault that the run does not survive."""
-        self._record_fault(sentence, DiagnosticStatus.ERROR)
+    def fail(self, sentence: str, lifetime: float = math.inf) -> None:
+        """Record and log a fault that the run does not survive.
+
+        :param lifetime: time for which it holds, s, of one that is reported again while it lasts.
+        """
+        self._record_fault(sentence, DiagnosticStatus.ERROR, lifetime)
 
     def note(self, sentence: str) -> None:
         """Log information; the last fault stays in /diagnostics."""
         self._node.get_logger().info(sentence)
 
-    def _record_fault(self, sentence: str, level: bytes) -> None:
+    def _record_fault(self, sentence: str, level: bytes, lifetime: float) -> None:
+        self._faults[level] = _Fault(sentence, time.monotonic() + lifetime)
+        self._error_at = datetime.now(UTC).isoformat(timespec="seconds")
         if sentence != self._error:
-            self._error, self._level = sentence, max(level, self._level)
+            self._error = sentence
             logger = self._node.get_logger()
             # rclpy raises where two levels are logged from one line of code.
             if level == DiagnosticStatus.ERROR:
@@ -156,18 +178,43 @@ class NodeDiagnostics:
             "longest message": f"{1e3 * self._longest:.1f} ms",
             "memory": f"{current_rss() / 1e6:.0f} MB",
             "peak memory": f"{peak_rss() / 1e6:.0f} MB",
+            STARTED: self.started,
             "last error": self._error,
+            "last error at": self._error_at,
         }
+        level, sentence = self._condition()
         status = DiagnosticStatus(
-            level=self._level,
+            level=level,
             name=self._node.get_fully_qualified_name(),
-            message=self._error or self.progress() or self._status_text,
+            message=sentence or self.progress() or self._status_text,
             hardware_id=HARDWARE_ID,
             values=[KeyValue(key=name, value=str(value)) for name, value in values.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._clock.now().to_msg()
-        self._publisher.publish(message)
+        for publisher in self._publishers:
+            publisher.publish(message)
+
+    def _condition(self) -> tuple[bytes, str]:
+        """The level of the node, and a sentence where it is not that all is well."""
+        now = time.monotonic()
+        for level in (DiagnosticStatus.ERROR, DiagnosticStatus.WARN):
+            fault = self._faults.get(level)
+            if fault is not None and now < fault.until:
+                return level, fault.sentence
+        if self._second_system:
+            return DiagnosticStatus.WARN, self.second_system_text
+        return DiagnosticStatus.OK, ""
+
+    @property
+    def second_system_text(self) -> str:
+        """A sentence about the second system."""
+        return f"a second system runs here, {self._second_system}: {REMEDY}"
+
+    @property
+    def _second_system(self) -> str:
+        """Another system that speaks on the topics of the node, or a topic with more publishers; empty without."""
+        return self.system.other or self.crowded_topic
 
     def _optional_values(self) -> dict[str, object]:
         """The system of the node, another one that speaks on its topics, and kernels; an entry where there is one.
@@ -176,7 +223,7 @@ class NodeDiagnostics:
         """
         values = {
             SYSTEM: self.system.name,
-            SECOND_SYSTEM: self.system.other or self.crowded_topic,
+            SECOND_SYSTEM: self._second_system,
             KERNELS: self.kernels(),
         }
         return {key: value for key, value in values.items() if value}
@@ -211,3 +258,8 @@ def _message_stamp(message: Message, default: int) -> int:
     if isinstance(message, Keyframe):
         return message.scan.stamp
     return int(getattr(message, "stamp", default))
+
+
+def is_of_other_namespace(status: DiagnosticStatus, node: Node) -> bool:
+    """Whether a node of the package that has another namespace sent a status; all of them send to one topic, too."""
+    return status.hardware_id == HARDWARE_ID and (status.name.rpartition("/")[0] or "/") != node.get_namespace()

@@ -39,7 +39,7 @@ from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import running_stamps
 from hmt_slam_ros.process_table import producer, topic_of
 from hmt_slam_ros.ros import conversions, topics
-from hmt_slam_ros.ros.diagnostics import STATE
+from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, STATE, SYSTEM, is_of_other_namespace
 from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, ODOM_FRAME
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, TFMessage
 from hmt_slam_ros.sensors import Odometry, Scan
@@ -112,6 +112,7 @@ class DoctorNode(Node):
         self._last_transforms: dict[tuple[str, str], tuple[int, bytes]] = {}
         self._conflicting_transforms: dict[str, int] = defaultdict(int)
         self._node_statuses: dict[str, NodeStatus] = {}
+        self._systems: set[str] = set()
         self._parameter_clients: dict[str, Client] = {}
         self._parameter_futures: dict[str, dict[str, Future]] = {}
         self.create_subscription(LaserScan, running.SCAN, self._on_scan, _BEST_EFFORT)
@@ -179,8 +180,13 @@ class DoctorNode(Node):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
+            if is_of_other_namespace(status, self):
+                continue
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
-            state = next((entry.value for entry in status.values if entry.key == STATE), "")
+            values = {entry.key: entry.value for entry in status.values}
+            state = values.get(STATE, "")
+            if status.hardware_id == HARDWARE_ID and values.get(SYSTEM):
+                self._systems.add(values[SYSTEM])
             self._node_statuses[status.name] = NodeStatus(status.name, level, status.message, state)
 
     def _on_static_transforms(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
@@ -228,6 +234,7 @@ class DoctorNode(Node):
             self._missing_laser_transform(),
             tuple(sorted(namespace for namespace, names in nodes.items() if set(names) & set(running.OUR_NODES))),
             tuple(self._frame_contradictions()),
+            tuple(sorted(self._systems)),
         )
 
     def _frame_contradictions(self) -> Iterator[FrameContradiction]:

@@ -41,7 +41,7 @@ from hmt_slam_ros.results.output_folder import RunMetrics, atomic_output, write_
 from hmt_slam_ros.results.recorder import Recorder, Recording
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import costs_from_message, stamp_from_time
-from hmt_slam_ros.ros.diagnostics import SYSTEM, NodeDiagnostics
+from hmt_slam_ros.ros.diagnostics import SYSTEM, NodeDiagnostics, is_of_other_namespace
 from hmt_slam_ros.ros.execution import wait_until_alone
 from hmt_slam_ros.ros.guarded_node import GuardedNode
 from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
@@ -152,7 +152,7 @@ class RecorderNode(GuardedNode):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         own = KeyValue(key=SYSTEM, value=self.diagnostics.system.name)
         for status in message.status:
-            if own not in status.values:
+            if own not in status.values or is_of_other_namespace(status, self):
                 continue
             name = status.name.rsplit("/", 1)[-1]
             self.diagnostics_stamps[name] = stamp_from_time(message.header.stamp)

@@ -38,7 +38,7 @@ from hmt_slam_ros.messages.messages import LocalEstimate, Message, TrackingReset
 from hmt_slam_ros.open_log import is_simulated, open_log
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.chain_writer import publish_reliably
-from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, KERNELS, LOADING, NodeDiagnostics
+from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, KERNELS, LOADING, NodeDiagnostics, is_of_other_namespace
 from hmt_slam_ros.ros.message_io import Inbox
 from hmt_slam_ros.ros.parameters import ConfiguredNode, declare_frame
 from hmt_slam_ros.ros.player import Player
@@ -173,7 +173,8 @@ class RobotNode(ConfiguredNode):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         """Wait for nodes that load their kernels for longer, and for those that compile them as long as they do."""
         for status in message.status:
-            for value in status.values if status.hardware_id == HARDWARE_ID else ():
+            is_ours = status.hardware_id == HARDWARE_ID and not is_of_other_namespace(status, self)
+            for value in status.values if is_ours else ():
                 if value.key == KERNELS and value.value.startswith(LOADING):
                     self._started_at = time.monotonic()
                     if value.value.startswith(COMPILING):

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import signal
+import socket
 import sys
 import traceback
 from contextlib import suppress
@@ -29,6 +31,8 @@ _MODULES = (
     "visualization_msgs.msg",
 )
 """Modules that rclpy and the nodes import, and that start no thread."""
+_MAX_HOST = 80
+"""Characters of the computer in the name of a system, which may have 100."""
 _MAX_NAME = 15
 """Characters of the name of an OS process."""
 
@@ -36,12 +40,20 @@ _MAX_NAME = 15
 def run_all() -> int:
     """Run all processes until SIGINT or SIGTERM, or until one ends with a fault; the arguments are those of each node.
 
-    A node that a signal kills is forked again.
+    A node that a signal kills is forked again. The parameter ``system`` is by default a name that no other program has.
 
     :returns: exit status.
     """
+    # One that the arguments give comes later, and so counts.
+    sys.argv[1:1] = ["--ros-args", "-p", f"system:={_system_name()}", "--"]
     _load_libraries()
     return _ForkedNodes().wait()
+
+
+def _system_name() -> str:
+    """Name of the system of this program, which no other program has."""
+    host = re.sub(r"[^\w.:+-]", "_", socket.gethostname(), flags=re.ASCII)
+    return f"{host[:_MAX_HOST]}-{os.getpid()}"
 
 
 def _load_libraries() -> None:

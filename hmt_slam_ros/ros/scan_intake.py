@@ -28,6 +28,8 @@ _TOPOLOGY_BEHIND = (
 _SLAM_BEHIND = "scans come faster than they can be worked off, so that not all are accepted: lower filter.particles"
 _TRANSFORM_TIMEOUT = 3.0
 """Time for which the scans of an unknown frame hold up those of known ones, s."""
+_REPORT_PERIOD = 10 * PERIOD
+"""Time between two reports of scans that wait, s."""
 _MAX_UNKNOWN_FRAMES = 4
 """Unknown frames for whose transform scans wait."""
 
@@ -182,7 +184,10 @@ class ScanIntake:
         now = time.monotonic()
         if not self._waiting or now - self._waiting_since <= 2 * PERIOD:
             return
-        report = self._node.diagnostics.fail if self._has_warned else self._node.diagnostics.warn
-        report(self._mountings.missing_transform_text(self._waiting[0], self.waiting_count))
+        sentence = self._mountings.missing_transform_text(self._waiting[0], self.waiting_count)
+        if self._has_warned:
+            self._node.diagnostics.fail(sentence, lifetime=2 * _REPORT_PERIOD)
+        else:
+            self._node.diagnostics.warn(sentence)
         self._has_warned = True
-        self._waiting_since = now + 10 * PERIOD
+        self._waiting_since = now + _REPORT_PERIOD

@@ -47,6 +47,8 @@ COST_HISTORY = QoSProfile(history=_KEEP_LAST, depth=100, reliability=_RELIABLE, 
 """Computing times of a node, once a second, with a row for each message."""
 LATCHED = QoSProfile(history=_KEEP_LAST, depth=1, reliability=_RELIABLE, durability=_TRANSIENT)
 """Maps, graphs and statuses: the newest message, also for late readers."""
+INCIDENT_HISTORY = QoSProfile(history=_KEEP_LAST, depth=100, reliability=_RELIABLE, durability=_TRANSIENT)
+"""What happened to the nodes; a late reader gets the newest."""
 TEAM_HISTORY = QoSProfile(history=_KEEP_LAST, depth=64, reliability=_RELIABLE, durability=_TRANSIENT)
 """Statuses and placements of a team; a late reader gets the newest of each robot."""
 TF_STATIC = QoSProfile(history=_KEEP_LAST, depth=100, reliability=_RELIABLE, durability=_TRANSIENT)
@@ -75,7 +77,8 @@ IS_LOCALIZED, ENTROPY = "hmt/is_localized", "hmt/entropy"
 AMBIGUITY_GOAL = "hmt/ambiguity_goal"
 INITIAL_POSE = "initialpose"
 RENDEZVOUS = "rendezvous"
-DIAGNOSTICS = "diagnostics"
+DIAGNOSTICS, AGGREGATED = "diagnostics", "/diagnostics"
+INCIDENTS = "hmt/incidents"
 
 DOCUMENTS: dict[type, str] = {row.message_class: row.topic for row in process_table.DOCUMENTS}
 """{class of a message that travels as a document: topic}."""

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
@@ -16,8 +17,16 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import ELLIPSE_95
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.ros.conversions import area_from_frame, gaussian_from_message, pose_from_message, stamp_from_time
+from hmt_slam_ros.ros.conversions import (
+    area_from_frame,
+    gaussian_from_message,
+    pose_from_message,
+    stamp_from_time,
+    time_message,
+)
+from hmt_slam_ros.ros.diagnostics import HARDWARE_ID
 from hmt_slam_ros.sensors.plausibility import MAX_COORDINATE, check_quaternion
+from hmt_slam_ros.view.incidents import Incident
 
 _MAX_CELLS = 64_000_000
 """Of a map: 400 m by 400 m in cells of 5 cm; its picture takes about a second."""
@@ -157,3 +166,18 @@ def _uncertainty(marker: Marker | None) -> dict[str, Any]:
 
 def _xy(point: Any) -> list[float]:  # noqa: ANN401  a ROS point
     return [round(finite(value, "position", MAX_COORDINATE), 3) for value in (point.x, point.y)]
+
+
+_LEVELS = {"good": DiagnosticStatus.OK, "attention": DiagnosticStatus.WARN, "fault": DiagnosticStatus.ERROR}
+
+
+def incident_message(incident: Incident, namespace: str) -> DiagnosticArray:
+    """An incident as a status of its node, with the time at which it happened.
+
+    :param namespace: of the node.
+    """
+    name = f"{namespace.rstrip('/')}/{incident.node}"
+    status = DiagnosticStatus(level=_LEVELS[incident.level], name=name, message=incident.text, hardware_id=HARDWARE_ID)
+    message = DiagnosticArray(status=[status])
+    message.header.stamp = time_message(round(incident.time * NANOSECONDS))
+    return message

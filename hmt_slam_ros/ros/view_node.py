@@ -22,7 +22,7 @@ from hmt_slam_ros.messages.documents import KeyframeHeader, RobotStatus
 from hmt_slam_ros.messages.messages import Hypotheses
 from hmt_slam_ros.process_table import TEAM, process_names, producer
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, SYSTEM, NodeDiagnostics
+from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, SYSTEM, NodeDiagnostics, is_of_other_namespace
 from hmt_slam_ros.ros.guarded_node import GuardedNode
 from hmt_slam_ros.ros.message_io import document_callback
 from hmt_slam_ros.ros.parameters import declare_system
@@ -33,6 +33,7 @@ from hmt_slam_ros.ros.topics import (
     ENTROPY,
     GRAPH,
     HMT_POSE,
+    INCIDENTS,
     IS_LOCALIZED,
     KEYFRAMES,
     MAP,
@@ -42,6 +43,7 @@ from hmt_slam_ros.ros.view_conversions import (
     area_section,
     finite,
     graph_section,
+    incident_message,
     map_cells,
     map_section,
     robot_section,
@@ -100,6 +102,7 @@ class ViewNode(GuardedNode):
         self.board = Board()
         self._health, self._history = SystemHealth(process_names()), KeyframeHistory(self.board)
         self._incidents = IncidentLog()
+        self._incident_publisher = self.create_publisher(DiagnosticArray, INCIDENTS, topics.INCIDENT_HISTORY)
         self._message_times: dict[str, float] = {}
         self._message_count = 0
         # In s; it stands still with the computer, so that no topic seems silent after that.
@@ -198,6 +201,7 @@ class ViewNode(GuardedNode):
         self.board.put("nodes", self._health.rows(now))
         for incident in self._incidents.update(self._health.nodes, now, time.time()):
             self.get_logger().info(f"{incident.node}: {incident.text}")
+            self._incident_publisher.publish(incident_message(incident, self.get_namespace()))
         self.board.put("incidents", self._incidents.rows())
         times = self._message_times
         # In whole seconds, so that the page changes once a second.
@@ -223,7 +227,7 @@ class ViewNode(GuardedNode):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.hardware_id == HARDWARE_ID:
+            if status.hardware_id == HARDWARE_ID and not is_of_other_namespace(status, self):
                 values = {entry.key: entry.value for entry in status.values}
                 if SYSTEM in values:  # a node that has received no document yet has none
                     self.diagnostics.system.admit(values[SYSTEM])

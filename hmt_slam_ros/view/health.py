@@ -29,9 +29,6 @@ _MAX_VALUES = 100
 _MAX_TEXT = 1000
 """Characters of a message or value that the page shows."""
 
-_WARNING_LIFETIME = 60.0
-"""Time for which the page shows a warning, s: the level of a node never falls."""
-
 _WARN = 1
 """Level of a warning in diagnostic_msgs/DiagnosticStatus."""
 
@@ -56,7 +53,6 @@ class NodeHealth:
     :ivar message: "running", or the last warning or error.
     :ivar values: {name: value}.
     :ivar heard_at: time of arrival, s.
-    :ivar changed_at: time at which the message arrived first, s.
     :ivar load: share of the time that the node computed between the last two diagnostics, None before the second.
     """
 
@@ -64,7 +60,6 @@ class NodeHealth:
     message: str
     values: Mapping[str, str]
     heard_at: float
-    changed_at: float
     load: float | None = None
 
 
@@ -96,12 +91,10 @@ class SystemHealth:
         if name not in self.nodes and name not in self.expected_nodes and len(self.nodes) >= _MAX_NODES:
             return
         values = {key[:_MAX_TEXT]: value[:_MAX_TEXT] for key, value in islice(values.items(), _MAX_VALUES)}
-        previous, load, changed = self.nodes.get(name), None, now
+        previous, load = self.nodes.get(name), None
         if previous is not None and now > previous.heard_at:
             load = max(0.0, busy_seconds(values) - busy_seconds(previous.values)) / (now - previous.heard_at)
-        if previous is not None and previous.message == message:
-            changed = previous.changed_at
-        self.nodes[name] = NodeHealth(level, message, values, now, changed, load)
+        self.nodes[name] = NodeHealth(level, message, values, now, load)
 
     def rows(self, now: float) -> list[dict[str, Any]]:
         """A row of the page for every node, the expected ones first."""
@@ -115,21 +108,21 @@ class SystemHealth:
         age = now - node.heard_at
         if age > NODE_TIMEOUT:
             return {"name": name, "level": "fault", "message": f"silent for {age:.0f} s", "values": dict(node.values)}
-        level = _level(node, now)
+        level = _level(node)
         row = {"name": name, "level": level, "message": node.message, "values": dict(node.values)}
         return row if node.load is None else {**row, "load": round(min(node.load, 1.0), 2)}
 
     def verdict(self, now: float) -> dict[str, str]:
         """The most serious condition: its level, a sentence and advice."""
-        diagnostics = self._diagnostics_verdicts(now)
+        diagnostics = self._diagnostics_verdicts()
         for verdict in (
             self._no_nodes_verdict(),
             self._silent_nodes_verdict(now),
             diagnostics.get("fault"),
             self._compiling_nodes_verdict(),
             self._inactive_nodes_verdict(),
-            self._pose_verdict(now),
             self._second_system_verdict(),
+            self._pose_verdict(now),
             diagnostics.get("attention"),
         ):
             if verdict is not None:
@@ -182,9 +175,9 @@ class SystemHealth:
                 return _verdict("waiting", f"{name} is {state}.", advice)
         return None
 
-    def _diagnostics_verdicts(self, now: float) -> dict[Level, dict[str, str]]:
+    def _diagnostics_verdicts(self) -> dict[Level, dict[str, str]]:
         """{level: verdict on the first node of that level}."""
-        levels = {name: _level(node, now) for name, node in self.nodes.items()}
+        levels = {name: _level(node) for name, node in self.nodes.items()}
         verbs: dict[Level, str] = {"fault": "has a fault", "attention": "warns"}
         return {
             level: _verdict(level, f"{name} {verbs[level]}.", self.nodes[name].message)
@@ -214,12 +207,12 @@ def _verdict(level: Level, text: str, advice: str = "") -> dict[str, str]:
     return {"level": level, "text": text, "advice": advice}
 
 
-def _level(node: NodeHealth, now: float) -> Level:
+def _level(node: NodeHealth) -> Level:
     if node.level > _WARN:
         return "fault"
     if _state(node) != _ACTIVE:
         return "waiting"
-    return "attention" if node.level == _WARN and now - node.changed_at < _WARNING_LIFETIME else "good"
+    return "attention" if node.level == _WARN else "good"
 
 
 def _state(node: NodeHealth) -> str:

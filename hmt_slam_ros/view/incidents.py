@@ -7,10 +7,13 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from hmt_slam_ros.view.health import NODE_TIMEOUT, NodeHealth, busy_seconds
+from hmt_slam_ros.view.health import NODE_TIMEOUT, NodeHealth
 
 _MOST = 100
 """Incidents that are kept, the newest."""
+
+_STARTED = "started at"
+"""Name of the value by which a node says when it started."""
 
 Kind = Literal["good", "attention", "fault"]
 _KINDS: dict[int, Kind] = {0: "good", 1: "attention"}
@@ -39,12 +42,12 @@ class _Known:
 
     :ivar message: its last warning or error, empty without.
     :ivar is_silent: whether no diagnostics come.
-    :ivar busy: computing time since its start, s.
+    :ivar started: time of its start in ISO 8601.
     """
 
     message: str = ""
     is_silent: bool = False
-    busy: float = 0.0
+    started: str = ""
 
 
 class IncidentLog:
@@ -66,7 +69,7 @@ class IncidentLog:
         """
         new = []
         for name, node in sorted(nodes.items()):
-            known = self._known.setdefault(name, _Known(busy=busy_seconds(node.values)))
+            known = self._known.setdefault(name, _Known(started=node.values.get(_STARTED, "")))
             new += [Incident(round(time, 1), name, level, text) for level, text in _changes(known, node, now)]
         self.incidents += new
         return new
@@ -79,10 +82,10 @@ class IncidentLog:
 def _changes(known: _Known, node: NodeHealth, now: float) -> list[tuple[Kind, str]]:
     """What changed since the last update, which is noted."""
     changes: list[tuple[Kind, str]] = []
-    is_silent, busy = now - node.heard_at > NODE_TIMEOUT, busy_seconds(node.values)
+    is_silent, started = now - node.heard_at > NODE_TIMEOUT, node.values.get(_STARTED, "")
     if is_silent and not known.is_silent:
         changes.append(("fault", "is silent"))
-    if busy < known.busy:
+    if started > known.started:
         changes.append(("attention", "was started again"))
         known.message = ""
     elif known.is_silent and not is_silent:
@@ -90,5 +93,5 @@ def _changes(known: _Known, node: NodeHealth, now: float) -> list[tuple[Kind, st
     message = node.message if node.level else ""
     if message and message != known.message:
         changes.append((_KINDS.get(node.level, "fault"), message))
-    known.message, known.is_silent, known.busy = message, is_silent, busy
+    known.message, known.is_silent, known.started = message, is_silent, max(started, known.started)
     return changes
