@@ -7,17 +7,19 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import OccupancyGrid
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.messages.documents import RobotStatus, decode
 from hmt_slam_ros.messages.messages import ClosureDecision
 from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.replay import RecorderNode
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, IS_LOCALIZED, MAP
 
 BUNDLED = Path(__file__).resolve().parent.parent / "data" / "malaga_one_loop"
@@ -85,3 +87,15 @@ def test_configure_is_answered_when_the_kernels_are_loaded_and_other_requests_me
     listener.until(answers[1].done)
     assert [answer.result().success for answer in answers] == [True, True]
     listener.until(lambda: kernel_entries(reported, "tsbi")[-1:] and "loaded" in kernel_entries(reported, "tsbi")[-1])
+
+
+def test_a_replay_does_not_stand_still_while_a_node_compiles(listener):
+    recorder = RecorderNode(Configuration(), listener.context, "one")
+    counts = []
+    for kernels in ("loading", "compiling kernels, 40 s left", "63 loaded"):
+        values = [KeyValue(key="system", value="one"), KeyValue(key="kernels", value=kernels)]
+        status = DiagnosticStatus(name="/tlca", hardware_id="hmt_slam_ros", values=values)
+        recorder._on_diagnostics(DiagnosticArray(status=[status]))
+        counts.append(recorder.message_count)
+    recorder.destroy_node()
+    assert counts == [0, 1, 1]

@@ -25,6 +25,7 @@ from std_msgs.msg import Float64MultiArray, String
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.documents import ros_yaml, yaml_value
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.kernel_loading import COMPILING
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.documents import RobotStatus
@@ -41,7 +42,7 @@ from hmt_slam_ros.results.output_folder import RunMetrics, atomic_output, write_
 from hmt_slam_ros.results.recorder import Recorder, Recording
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import costs_from_message, stamp_from_time
-from hmt_slam_ros.ros.diagnostics import SYSTEM, NodeDiagnostics, is_of_other_namespace
+from hmt_slam_ros.ros.diagnostics import KERNELS, SYSTEM, NodeDiagnostics, is_of_other_namespace
 from hmt_slam_ros.ros.execution import wait_until_alone
 from hmt_slam_ros.ros.guarded_node import GuardedNode
 from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
@@ -156,6 +157,8 @@ class RecorderNode(GuardedNode):
                 continue
             name = status.name.rsplit("/", 1)[-1]
             self.diagnostics_stamps[name] = stamp_from_time(message.header.stamp)
+            # Compilation may take longer than a run may stand still.
+            self.message_count += any(v.key == KERNELS and v.value.startswith(COMPILING) for v in status.values)
             if status.level == DiagnosticStatus.ERROR and self.fault is None:
                 self.fault = f"{name}: {status.message}"
 
