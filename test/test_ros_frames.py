@@ -9,9 +9,10 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry as OdometryMessage
 
+from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import odometry_message
-from hmt_slam_ros.ros.topics import DIAGNOSTICS, TFMessage
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, TFMessage
 from hmt_slam_ros.sensors import Odometry
 
 WHEELS = {"odom_frame": "wheel_odom", "base_frame": "foot"}
@@ -21,7 +22,10 @@ WHEELS = {"odom_frame": "wheel_odom", "base_frame": "foot"}
 def test_without_parameters_the_transforms_are_one_tree(listener, start, tmp_path):
     transforms = listener.subscribe(TFMessage, "tf", topics.STREAM)
     nodes = [start("slam"), start("rtl")]
-    robot = {"robot__flow_control": False, "robot__odometry_listeners": 2, "robot__rate": 4.0}
+    # Rtl goes by the first estimate, after which slam waits for topology.
+    estimates = DOCUMENTS[LocalEstimate]
+    listener.until(lambda: listener.node.count_publishers(estimates) and listener.node.count_subscribers(estimates))
+    robot = {"robot__flow_control": False, "robot__odometry_listeners": 2, "robot__rate": 1.0}
     nodes.append(start("robot", log=corridor_bag(tmp_path, 40), **robot, **WHEELS))
 
     def joints():

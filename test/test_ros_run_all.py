@@ -38,10 +38,10 @@ def shared_bytes(pid):
 
 def test_a_node_that_is_killed_is_forked_again_and_the_map_is_whole(corridor, listener, start, tmp_path):
     nodes = ForkedNodes(start, listener, recovery=tmp_path / "recovery")
-    nodes.drive(corridor[0], 0)
-    nodes.until(lambda: len(nodes.estimates) >= SCANS // 3)
     system = f"{socket.gethostname()}-{nodes.program.pid}"
     nodes.until(lambda: nodes.diagnosis("tsbi")["system"] == system)
+    nodes.drive(corridor[0], 0)
+    nodes.until(lambda: len(nodes.estimates) >= SCANS // 3)
     before = nodes.pids()
     assert set(before) == {f"hmt_slam_{name}" for name in NODES}
     assert all(shared_bytes(pid) > 20e6 for pid in before.values())
