@@ -1,14 +1,19 @@
 """Frames are those of the odometry's messages, and a parameter that contradicts them is a fault."""
 
+from itertools import count
+
 import pytest
-from logs_for_nodes import corridor_bag
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry as OdometryMessage
+from std_msgs.msg import String
+from test_ros_mountings import Laser, joint
 
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.messages.documents import encode
 from hmt_slam_ros.messages.messages import LocalEstimate
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import odometry_message
@@ -19,20 +24,33 @@ WHEELS = {"odom_frame": "wheel_odom", "base_frame": "foot"}
 
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh")
-def test_without_parameters_the_transforms_are_one_tree(listener, start, tmp_path):
+def test_without_a_parameter_rtl_leads_to_the_frame_of_the_odometry(listener, start):
     transforms = listener.subscribe(TFMessage, "tf", topics.STREAM)
-    nodes = [start("slam"), start("rtl")]
-    # Rtl goes by the first estimate, after which slam waits for topology.
-    estimates = DOCUMENTS[LocalEstimate]
-    listener.until(lambda: listener.node.count_publishers(estimates) and listener.node.count_subscribers(estimates))
-    robot = {"robot__flow_control": False, "robot__odometry_listeners": 2, "robot__rate": 1.0}
-    nodes.append(start("robot", log=corridor_bag(tmp_path, 40), **robot, **WHEELS))
+    odometry = listener.node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
+    estimates = listener.node.create_publisher(String, DOCUMENTS[LocalEstimate], topics.ESTIMATE_HISTORY)
+    numbers = count()
 
-    def joints():
-        return {(each.header.frame_id, each.child_frame_id) for message in transforms for each in message.transforms}
+    def drive():
+        number = next(numbers)
+        reading = Odometry(10**9 + number * 50_000_000, np.zeros(3))
+        odometry.publish(odometry_message(reading, *WHEELS.values()))
+        belief = PoseGaussian(np.zeros(3), 1e-4 * np.eye(3))
+        estimate = LocalEstimate(reading.stamp, number, 0, belief, reading.pose, 0)
+        estimates.publish(String(data=encode(estimate)))
 
-    listener.until(lambda: any(parent == "map" for parent, _ in joints()), alive=nodes)
-    assert joints() == {("map", "wheel_odom"), ("wheel_odom", "foot")}
+    listener.node.create_timer(0.05, drive)
+    process = start("rtl")
+    listener.until(lambda: transforms, alive=[process])
+    (map_T_odom,) = transforms[0].transforms
+    assert (map_T_odom.header.frame_id, map_T_odom.child_frame_id) == ("map", "wheel_odom")
+
+
+@pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh")
+def test_without_a_parameter_the_robot_has_the_child_frame_of_the_odometry(listener, start):
+    laser = Laser(listener, start)
+    laser.join(joint(parent="foot"))
+    laser.drive(2, base_frame="foot")
+    laser.until("received Scan", 2)
 
 
 @pytest.mark.parametrize(("node", "parameter"), [("rtl", "odom_frame"), ("slam", "base_frame")])

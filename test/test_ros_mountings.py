@@ -53,11 +53,11 @@ class Laser:
         listener.until(lambda: self._scans.get_subscription_count() and self._odom.get_subscription_count())
         self._measurements = iter(record.measurement for record in Corridor(60).records())
 
-    def drive(self, scans, frame="laser"):
+    def drive(self, scans, frame="laser", base_frame="base_link"):
         """Send scans, and the odometry between."""
         for _ in range(scans):
             while not isinstance(one := next(self._measurements), Scan):
-                self._odom.publish(conversions.odometry_message(one, "odom", "base_link"))
+                self._odom.publish(conversions.odometry_message(one, "odom", base_frame))
             self._scans.publish(conversions.scan_message(one, frame))
 
     def join(self, *transforms):
