@@ -37,6 +37,21 @@ def maps(tmp_path_factory):
     return folder
 
 
+def test_the_trajectory_of_a_joined_map_has_the_scans_of_all(maps, tmp_path):
+    """The two drove one after another; with one of another building there is no trajectory."""
+    assert merge(maps / "one", maps / "two", "--out", tmp_path / "joined") == 0
+    whole = read_tum(tmp_path / "joined" / "trajectory.tum")
+    one, two = (read_tum(maps / name / "trajectory.tum") for name in ("one", "two"))
+    assert whole.stamps.tolist() == [*one.stamps, *two.stamps[1:]]
+    truth = read_true_poses(open_log(WORLD)).poses
+    # From the middle of the first lap to that of the second.
+    a, b = len(one.stamps) // 2, len(one.stamps) + len(two.stamps) // 2
+    error = se2.between(se2.between(truth[a], truth[b]), se2.between(whole.poses[a], whole.poses[b]))
+    assert abs(error[0]) < 0.2 and abs(error[1]) < 0.2
+    assert merge(maps / "one", maps / "elsewhere", "--out", tmp_path / "apart") == 0
+    assert not (tmp_path / "apart" / "trajectory.tum").exists()
+
+
 def merge(*arguments):
     return main(["merge", *map(str, arguments)])
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.arrays import Int64
 from hmt_slam_ros.configuration import Configuration, as_flat, as_nested
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.evaluation import StampedPoses, read_tum, write_tum
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.grids.occupancy_map import occupancy_image, write_map
@@ -24,7 +27,7 @@ from hmt_slam_ros.messages.team import Verdict
 from hmt_slam_ros.results.export import export_topology
 from hmt_slam_ros.results.hmt_map import SavedMap, read_clutter, read_saved_map
 from hmt_slam_ros.results.log_reading import FIXED_PARAMETERS, map_folder
-from hmt_slam_ros.results.output_folder import MERGE_REPORT, TEAM_PICTURE, map_writer
+from hmt_slam_ros.results.output_folder import MERGE_REPORT, TEAM_PICTURE, TRAJECTORY, map_writer
 from hmt_slam_ros.results.recorder import keyframe_poses
 from hmt_slam_ros.results.trajectories import RelativeTrajectory, Trajectory, trajectory_in_map
 from hmt_slam_ros.team.components import Component
@@ -44,6 +47,7 @@ class RobotMap:
     :ivar saved: the map.
     :ivar hybrid_map: of its most probable hypothesis, without ground of other robots.
     :ivar relative_trajectory: of the scans, relative to keyframes of that ground.
+    :ivar stamps: of the scans in the log, shape (n,), ns; empty where no output folder is around the map.
     :ivar components: {name: piece of it that arcs hold together}.
     """
 
@@ -51,6 +55,7 @@ class RobotMap:
     saved: SavedMap
     hybrid_map: HybridMap
     relative_trajectory: RelativeTrajectory
+    stamps: Int64
     components: dict[str, Component]
 
 
@@ -90,7 +95,12 @@ def _read_robot(path: Path, name: str) -> RobotMap:
     if not _keyframes(hybrid_map):
         raise HmtSlamError(f"{path} has no keyframes to join another map by: leave it out")
     component = Component.of_map(hybrid_map, saved.replica.scans, read_clutter(map_folder(path)))
-    return RobotMap(name, saved, hybrid_map, relative, split_component(name, component))
+    return RobotMap(name, saved, hybrid_map, relative, _read_stamps(path), split_component(name, component))
+
+
+def _read_stamps(path: Path) -> Int64:
+    file = map_folder(path).absolute().parent / TRAJECTORY
+    return read_tum(file).stamps if file.is_file() else np.zeros(0, np.int64)
 
 
 def _keyframes(hybrid_map: HybridMap) -> list[int]:
@@ -117,7 +127,8 @@ def _scan_keys(robot: RobotMap) -> set[tuple[int, bytes]]:
 def write_merged(directory: Path, robots: Sequence[RobotMap], team: TeamMap, configuration: Configuration) -> None:
     """Write hmt_map, map.pgm, map.yaml, map.png, team.png, topology.graphml with its tables, and merge.json.
 
-    The map has no state of a run. Pieces whose places are unknown stand beside one another.
+    The map has no state of a run. Pieces whose places are unknown stand beside one another. Where all is in one piece,
+    and the robots drove one after another, trajectory.tum has their scans.
 
     :param directory: an empty folder.
     """
@@ -137,7 +148,11 @@ def write_merged(directory: Path, robots: Sequence[RobotMap], team: TeamMap, con
     from hmt_slam_ros.results.plots import draw_map, draw_team  # noqa: PLC0415  matplotlib takes long to load
 
     draw_team(directory / TEAM_PICTURE, _surfaces(robots, whole, keyframe_poses(hybrid_map, area_poses)))
-    draw_map(directory, read_saved_map(map_folder(directory)), _path(relative, starts, hybrid_map, area_poses))
+    path = _path(relative, hybrid_map, area_poses)
+    if len(team.pieces) == 1:
+        _write_trajectory(directory, robots, path)
+    path[[start for start in starts if start < len(path)]] = np.nan
+    draw_map(directory, read_saved_map(map_folder(directory)), path)
 
 
 def _write_grid(
@@ -183,15 +198,24 @@ def _trajectories(robots: Sequence[RobotMap], whole: Piece) -> tuple[RelativeTra
     return RelativeTrajectory(np.concatenate(keyframes), np.concatenate(poses)), starts
 
 
-def _path(
-    relative: RelativeTrajectory, starts: list[int], hybrid_map: HybridMap, area_poses: dict[int, PoseGaussian]
-) -> Trajectory:
-    """``map_T_base`` of all scans, shape (n, 3), with NaN between two robots."""
+def _path(relative: RelativeTrajectory, hybrid_map: HybridMap, area_poses: dict[int, PoseGaussian]) -> Trajectory:
+    """``map_T_base`` of all scans, shape (n, 3)."""
     if not (relative.keyframes != NO_KEYFRAME).any():
         return np.full(relative.poses.shape, np.nan)
-    path = trajectory_in_map(relative, keyframe_poses(hybrid_map, area_poses))
-    path[[start for start in starts if start < len(path)]] = np.nan
-    return path
+    return trajectory_in_map(relative, keyframe_poses(hybrid_map, area_poses))
+
+
+def _write_trajectory(directory: Path, robots: Sequence[RobotMap], path: Trajectory) -> None:
+    """Write the trajectory of all robots, if it is one drive after another.
+
+    :param path: shape (n, 3), of all scans.
+    """
+    drives = sorted((robot.stamps for robot in robots), key=lambda stamps: stamps[:1].tolist())
+    if sum(map(len, drives)) != len(path) or any(a[-1] > b[0] for a, b in pairwise(drives)):
+        return
+    # A scan at which a log is cut in two may be in both parts.
+    stamps, first = np.unique(np.concatenate([robot.stamps for robot in robots]), return_index=True)
+    write_tum(directory / TRAJECTORY, StampedPoses(stamps, path[first]))
 
 
 def _replica(robot: RobotMap, whole: Piece) -> Replica:

@@ -31,6 +31,9 @@ from hmt_slam_ros.results.recorder import Recording, keyframe_poses
 from hmt_slam_ros.saved_map.folder import FORMAT, HMT_MAP, MANIFEST, foreign_entry
 from hmt_slam_ros.sensors import Scan
 
+TRAJECTORY = "trajectory.tum"
+"""File of the pose of every scan."""
+
 EARLIER_LOGS = "earlier"
 """Folder of the trajectories of earlier logs: 1.tum, 2.tum and so on."""
 
@@ -42,7 +45,7 @@ MERGE_REPORT, TEAM_PICTURE = "merge.json", "team.png"
 
 OUTPUT_FILES = frozenset(
     {
-        "trajectory.tum",
+        TRAJECTORY,
         "trajectory_online.tum",
         "map.pgm",
         "map.yaml",
