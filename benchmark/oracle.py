@@ -34,6 +34,7 @@ from hmt_slam_ros.topological_inference.candidate_gating import AreaCandidate, Q
 from hmt_slam_ros.topological_inference.closure_search import ClosureSearch
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
 from hmt_slam_ros.topological_inference.map_search import MapSearch
+from hmt_slam_ros.topological_inference.marks import AreaMark
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 WORLDS = {
@@ -299,9 +300,10 @@ class _EverywhereSearch(_UnboundedSearch):
         most: int,
         kind: ComparisonKind = "recheck",
         only: Collection[int] = (),
+        marks: Mapping[int, AreaMark] | None = None,
     ) -> OngoingComparison:
         """Compare as ``ClosureSearch`` does, with all areas."""
-        del most, only
+        del most, only, marks
         unmatched = {
             known: {k: pose for k, pose in query.poses.items() if k not in compare_drive.get(known, ())}
             for known in hybrid_map.area_ids()

@@ -104,7 +104,7 @@ PROCESSES: tuple[ProcessRow, ...] = (
         name="slam",
         title="metric SLAM in the local area",
         node_class=f"{_ROS}.slam_node:SlamNode",
-        consumes=("Scan", "Odometry", "PoseReset", "Hypotheses", "ClosureDecision", "EndOfLog"),
+        consumes=("Scan", "Odometry", "MarkObservation", "PoseReset", "Hypotheses", "ClosureDecision", "EndOfLog"),
         factory=f"{_COMPOSITION}:metric_slam",
         state="hmt_slam_ros.metric_slam.slam:SlamState",
         produces=("TrackingReset", "Keyframe", "ScanPoses", "LocalEstimate", "EarlyEstimate", "EndOfRun"),
@@ -194,7 +194,7 @@ RECORDER = NodeRow(
 """The recorder of both runtimes. In a replay, its node runs in the OS process that started the others."""
 
 DOCUMENTS: tuple[DocumentRow, ...] = (
-    DocumentRow(f"{_DOCUMENTS}:KeyframeHeader", "hmt/keyframes", "keyframe", 12),
+    DocumentRow(f"{_DOCUMENTS}:KeyframeHeader", "hmt/keyframes", "keyframe", 13),
     DocumentRow(f"{_MESSAGES}:AreaEvents", "hmt/area_events", "area_events", 4),
     DocumentRow(f"{_MESSAGES}:Hypotheses", "hmt/hypotheses", "hypotheses", 9),
     DocumentRow(f"{_MESSAGES}:ClosureDecision", "hmt/closure_decisions", "closure_decision", 2),

@@ -69,6 +69,7 @@ class Run:
         self.evidence = {}
         self.stored = True
         self.stale_beams = ()
+        self.marks = ()
 
     def keyframe(self, true_pose, cut=0, moved=None, merged=None, mapping=True, motion_condition="ordinary"):
         """One keyframe event; ``cut`` is how many of the newest keyframes leave the area, in every hypothesis.
@@ -105,6 +106,7 @@ class Run:
             mapping=mapping,
             stale_beams=self.stale_beams,
             motion_condition=motion_condition,
+            marks=self.marks,
         )
         assert self.tsbi.handle(message) == []
         self.replica.add_keyframe(message)

@@ -35,6 +35,7 @@ SOMETIMES = {
     "/tf_static": "without laser_pose",
     "/ground_truth": "from a simulated log",
     "/cmd_vel": "with robot.drive: commands",
+    "/marks": "with marks.topic",
     "/map": "while the live page is open",
     "/pose": "goes with hmt/pose",
 }

@@ -187,6 +187,20 @@ class RefinementParameters:
 
 
 @dataclass(frozen=True)
+class MarkParameters:
+    """Observations of marks with names."""
+
+    topic: str = parameter(
+        "",
+        "Topic of geometry_msgs/PoseWithCovarianceStamped: poses of the robot in frames that are named after marks; "
+        "empty for none.",
+    )
+    wrong_share: float = parameter(
+        0.05, "Prior probability that a mark is another one than its name says, or in another place.", 0.001, 0.5
+    )
+
+
+@dataclass(frozen=True)
 class TeamParameters:
     """Other robots of a team."""
 

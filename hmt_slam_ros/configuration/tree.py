@@ -24,6 +24,7 @@ from hmt_slam_ros.configuration.topology import (
     AreaAbstractionParameters,
     InferenceParameters,
     LoopClosureParameters,
+    MarkParameters,
     RefinementParameters,
     TeamParameters,
 )
@@ -51,6 +52,7 @@ class Configuration:
     tsbi: InferenceParameters = field(default_factory=InferenceParameters)
     tlca: LoopClosureParameters = field(default_factory=LoopClosureParameters)
     refinement: RefinementParameters = field(default_factory=RefinementParameters)
+    marks: MarkParameters = field(default_factory=MarkParameters)
     team: TeamParameters = field(default_factory=TeamParameters)
     features: FeatureParameters = field(default_factory=FeatureParameters)
     places: PlaceParameters = field(default_factory=PlaceParameters)

@@ -22,7 +22,7 @@ from hmt_slam_ros.messages.messages import EndOfRun, HypothesisEstimate, Keyfram
 from hmt_slam_ros.plain_data import PlainDataReader, Reader, to_plain
 from hmt_slam_ros.process_table import DOCUMENTS
 from hmt_slam_ros.saved_map.folder import FileRecord
-from hmt_slam_ros.sensors import Scan
+from hmt_slam_ros.sensors import MarkObservation, Scan
 from hmt_slam_ros.untrusted_input import parse_json, shorten
 
 Document = TypeVar("Document")
@@ -55,6 +55,7 @@ class KeyframeHeader:
     mapping: bool
     stale_beams: tuple[StaleBeams, ...]
     motion_condition: MotionCondition
+    marks: tuple[MarkObservation, ...]
 
     @classmethod
     def from_keyframe(cls, keyframe: Keyframe) -> KeyframeHeader:

@@ -43,6 +43,7 @@ from hmt_slam_ros.messages.team import (
 )
 from hmt_slam_ros.plain_data import field_names, is_record
 from hmt_slam_ros.process_table import participant_names
+from hmt_slam_ros.sensors.mark import MarkObservation, check_mark
 from hmt_slam_ros.sensors.plausibility import MAX_COORDINATE, check_scan
 
 Document = TypeVar("Document")
@@ -135,14 +136,21 @@ def _check_kind(message: object) -> None:
         _check_looks(message)
     elif isinstance(message, Keyframe):
         check_scan(message.scan)
+        _check_marks(message.marks)
     elif isinstance(message, KeyframeHeader):
         check_scan(message.to_keyframe(np.ones(1, dtype=np.float32)).scan)
+        _check_marks(message.marks)
     elif isinstance(message, SaveRequest | ResetRequest):
         _check_request_number("number", message.number)
     elif isinstance(message, SaveResponse | ResetResponse):
         _check_response(message)
     elif isinstance(message, TeamMessage | JoinedGround):
         _check_team_message(message)
+
+
+def _check_marks(marks: Iterable[MarkObservation]) -> None:
+    names = [check_mark(observation).name for observation in marks]
+    _require(len(names) == len(set(names)), "marks", names, "one of each name")
 
 
 def decode_of_team(text: str, kind: type[Document]) -> Document:

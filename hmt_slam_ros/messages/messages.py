@@ -1,8 +1,8 @@
 """The messages between the processes, as immutable values.
 
-Scans and odometry are :class:`~hmt_slam_ros.sensors.Scan` and :class:`~hmt_slam_ros.sensors.Odometry`. A *keyframe
-event* k starts the chain Keyframe(k) -> AreaEvents(k) -> Hypotheses(k) -> ClosureDecision(k). After it metric SLAM
-processes the scans that waited.
+Scans, odometry and marks are :class:`~hmt_slam_ros.sensors.Scan`, :class:`~hmt_slam_ros.sensors.Odometry` and
+:class:`~hmt_slam_ros.sensors.MarkObservation`. A *keyframe event* k starts the chain Keyframe(k) -> AreaEvents(k) ->
+Hypotheses(k) -> ClosureDecision(k). After it metric SLAM processes the scans that waited.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from hmt_slam_ros.messages.map_changes import (
 from hmt_slam_ros.messages.tasks import GoalPose, PlaceEstimate, Task, TaskResult, VelocityCommand
 from hmt_slam_ros.messages.team import JoinedGround, TeamMessage
 from hmt_slam_ros.registration.consistency import Clutter
-from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors import MarkObservation, Odometry, Scan
 
 MotionCondition = Literal["ordinary", "after_gap", "uncertain"]
 """What the motion since the last keyframe event rests on.
@@ -88,6 +88,7 @@ class Keyframe:
     :ivar mapping: whether the map may change. A lost robot may add to it even where it may not.
     :ivar stale_beams: beams in the map of the only hypothesis that the last scans refute.
     :ivar motion_condition: of the motion since the last keyframe.
+    :ivar marks: the newest observation since then of each mark, at the pose of the keyframe.
     """
 
     sequence: int
@@ -99,6 +100,7 @@ class Keyframe:
     mapping: bool = True
     stale_beams: tuple[StaleBeams, ...] = ()
     motion_condition: MotionCondition = "ordinary"
+    marks: tuple[MarkObservation, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -377,6 +379,7 @@ class Notice:
 Message = (
     Scan
     | Odometry
+    | MarkObservation
     | Keyframe
     | AreaEvents
     | Hypotheses

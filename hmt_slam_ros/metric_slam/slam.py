@@ -44,7 +44,8 @@ from hmt_slam_ros.messages.messages import (
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
 from hmt_slam_ros.metric_slam.intake import Intake, OdometryMonitorState, ScanQueueState
 from hmt_slam_ros.metric_slam.live_hypothesis import LiveHypothesis, LiveHypothesisState
-from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.metric_slam.marks import MarkQueue
+from hmt_slam_ros.sensors import MarkObservation, Measurement, Scan
 from hmt_slam_ros.sensors.motion_model import MotionState, Prediction
 from hmt_slam_ros.sensors.odometry import deskew_scan
 from hmt_slam_ros.sensors.relative_motion import is_wide
@@ -73,6 +74,7 @@ class SlamState:
     :ivar lost: whether the robot may be anywhere in the map, under all hypotheses.
     :ivar initial_pose: pose at the next scan that a person gave, None without one.
     :ivar motion_condition: of the motion since the last keyframe event.
+    :ivar marks: observations of marks since then.
     """
 
     replica: ReplicaState = field(default_factory=ReplicaState)
@@ -91,13 +93,14 @@ class SlamState:
     lost: bool = False
     initial_pose: InitialPose | None = None
     motion_condition: MotionCondition = "ordinary"
+    marks: MarkQueue = field(default_factory=MarkQueue)
 
 
 class MetricSlam:
     """The metric SLAM process.
 
-    Consumes Scan, Odometry, PoseReset, Hypotheses, ClosureDecision, EndOfLog; produces TrackingReset, Keyframe,
-    ScanPoses, LocalEstimate, Notice, EndOfRun.
+    Consumes Scan, Odometry, MarkObservation, PoseReset, Hypotheses, ClosureDecision, EndOfLog; produces TrackingReset,
+    Keyframe, ScanPoses, LocalEstimate, Notice, EndOfRun.
 
     :ivar mapping: the parts that all filters share.
     :ivar intake: scans and odometry on their way into the filters.
@@ -235,7 +238,7 @@ class MetricSlam:
 
     def handle(self, message: Message) -> list[Message]:
         """Process a message, and the scans that are ready then; returns the answers."""
-        if isinstance(message, Odometry | Scan):
+        if isinstance(message, Measurement):
             notices = self.enqueue(message)
             return notices if self.is_interrupted else notices + self.process_queue()
         # A slam that handles the journal of a killed one reaches the event of an answer only here.
@@ -257,8 +260,11 @@ class MetricSlam:
         self._state = replace(self._state, initial_pose=initial_pose)
         return [] if self._state.lost and initial_pose is not None else self._reset_tracking()
 
-    def enqueue(self, measurement: Odometry | Scan) -> list[Message]:
+    def enqueue(self, measurement: Measurement) -> list[Message]:
         """Add a measurement; returns notices of its faults."""
+        if isinstance(measurement, MarkObservation):
+            self._state = replace(self._state, marks=self._state.marks.add(measurement))
+            return []
         return self.intake.add(measurement)
 
     def add_to_replica(self, keyframe: Keyframe) -> None:
@@ -300,7 +306,9 @@ class MetricSlam:
         """Restart tracking at the next scan; scans that still wait are dropped, as they are from before."""
         dropped = self._state.dropped_scans + len(self.intake.queue)
         self.intake = self.intake.restart()
-        self._state = replace(self._state, dropped_scans=dropped, reset_pending=True, motion_condition="ordinary")
+        self._state = replace(
+            self._state, dropped_scans=dropped, reset_pending=True, motion_condition="ordinary", marks=MarkQueue()
+        )
         return [TrackingReset(self._state.keyframe_events, self._state.processed_scans)]
 
     def _process_scan(self, scan: Scan) -> list[Message]:
@@ -340,7 +348,8 @@ class MetricSlam:
         best = tracked[self._replica.best_hypothesis]
         path_length = self._state.path_length + math.hypot(best.increment[0], best.increment[1])
         condition = self._motion_condition(prediction, contradicted=best.contradicts_odometry)
-        self._state = replace(self._state, path_length=path_length, motion_condition=condition)
+        marks = self._state.marks.after_scan(prepared.scan.stamp, best.increment)
+        self._state = replace(self._state, path_length=path_length, motion_condition=condition, marks=marks)
         return self.intake.observe(prepared.scan.stamp, prediction, best)
 
     def _motion_condition(self, prediction: Prediction, *, contradicted: bool) -> MotionCondition:
@@ -372,6 +381,7 @@ class MetricSlam:
         last = self.best_hypothesis.event
         self.intake.motion.observe_keyframe(last.motion, last.match_information)
         after_reset, initial_pose = self._state.reset_pending, self._state.initial_pose
+        marks, queue = self._state.marks.take()
         keyframe = Keyframe(
             sequence,
             scan,
@@ -382,6 +392,7 @@ class MetricSlam:
             self.is_mapping,
             combine_stale_beams(changes),
             self._state.motion_condition,
+            marks,
         )
         self.add_to_replica(keyframe)
         # An initial pose is kept for one more event: the next scan is searched for there, even if the robot stands.
@@ -392,6 +403,7 @@ class MetricSlam:
             reset_pending=False,
             initial_pose=initial_pose if after_reset else None,
             motion_condition="ordinary",
+            marks=queue,
         )
         return [*scan_poses, keyframe, *self.intake.check_noise()]
 

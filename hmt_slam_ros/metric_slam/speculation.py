@@ -25,7 +25,7 @@ from hmt_slam_ros.messages.messages import (
 )
 from hmt_slam_ros.metric_slam.look_ahead import LookAhead
 from hmt_slam_ros.metric_slam.slam import MetricSlam, SlamState
-from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors import Measurement, Odometry
 from hmt_slam_ros.submap.local_filter import FilterFactory
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 from hmt_slam_ros.submap.particle_filter import ParticleFilters
@@ -126,7 +126,7 @@ class SpeculativeSlam(MetricSlam):
         self._forks = deque[_Fork]()
         self._steps = deque[_Step]()
         # Measurements that this has and the copies do not.
-        self._unseen = list[Scan | Odometry]()
+        self._unseen = list[Measurement]()
         self._early = list[EarlyEstimate]()
         self._look_ahead: LookAhead | None = None
         self._next_early = 0
@@ -171,7 +171,7 @@ class SpeculativeSlam(MetricSlam):
         self._forks.append(fork)
         self._go_on(fork.assume_unchanged)
 
-    def work_ahead(self, measurement: Scan | Odometry) -> bool:
+    def work_ahead(self, measurement: Measurement) -> bool:
         """Process a measurement before its turn, the first that was not; :meth:`handle` gets it later.
 
         :returns: whether it was processed; not where no answer is due, or too many would be assumed.
@@ -241,7 +241,7 @@ class SpeculativeSlam(MetricSlam):
 
     def handle(self, message: Message) -> list[Message]:
         """As in :class:`MetricSlam`."""
-        if isinstance(message, Scan | Odometry):
+        if isinstance(message, Measurement):
             return self._handle_measurement(message)
         if self._look_ahead is not None:
             self._look_ahead.leave_map()
@@ -251,7 +251,7 @@ class SpeculativeSlam(MetricSlam):
             return self._adopt_fork(message)
         return super().handle(message)
 
-    def _handle_measurement(self, measurement: Scan | Odometry) -> list[Message]:
+    def _handle_measurement(self, measurement: Measurement) -> list[Message]:
         if self._look_ahead is not None and isinstance(measurement, Odometry):
             self._look_ahead.add_odometry(measurement)
         if self._steps:

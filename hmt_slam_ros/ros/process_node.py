@@ -41,7 +41,8 @@ from hmt_slam_ros.ros.recovery import (
     declare_recovery,
 )
 from hmt_slam_ros.ros.request_participant import ParticipantNode, RequestParticipant
-from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors import MarkObservation, Odometry, Scan
+from hmt_slam_ros.sensors.mark import check_mark
 from hmt_slam_ros.sensors.plausibility import check_odometry, check_scan
 from hmt_slam_ros.untrusted_input import shorten
 
@@ -479,6 +480,8 @@ def _checked_input(value: Message | ControlEvent | UnreadableInput) -> Message |
         check_scan(value)
     elif isinstance(value, Odometry):
         check_odometry(value)
+    elif isinstance(value, MarkObservation):
+        check_mark(value)
     return value
 
 

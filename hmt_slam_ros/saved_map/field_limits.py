@@ -129,6 +129,7 @@ _SHAPES: Mapping[str, Mapping[str, str]] = {
         "keyframes": "k",
         "poses": "k 3",
     },
+    "ScanStep": {"increment": "3"},
     "ScanTable": {
         "names": "n",
         "stamps": "n",
@@ -169,7 +170,7 @@ _LIMITS: Mapping[str, tuple[float, float]] = {
     **dict.fromkeys(("processed_scans", "dropped_scans", "first_unpublished_scan", "next_hypothesis"), _NUMBER),
     **dict.fromkeys(("leader", "detections", "misses", "sightings", "next_number", "sizes"), _NUMBER),
     **dict.fromkeys(("scan_index", "dropped", "separation_count", "dominant_keyframes", "change_count"), _NUMBER),
-    **dict.fromkeys(("members", "mode_count", "kidnappings"), _NUMBER),
+    **dict.fromkeys(("members", "mode_count", "kidnappings", "first_event", "last_event"), _NUMBER),
     **dict.fromkeys(("unreported", "beams", "hypothesis", "graph", "map_sizes", "checksum"), _NUMBER),
     **dict.fromkeys(("keyframes", "keyframe", "anchor", "second_keyframes"), _KEYFRAME),
     **dict.fromkeys(("event", "id", "parent", "hypotheses", "since", "published_change"), _NUMBER_OR_NONE),
@@ -184,7 +185,9 @@ _LIMITS: Mapping[str, tuple[float, float]] = {
     ),
     **dict.fromkeys(("inliers", "outliers", "distance", "angle", "periods", "last_interval", "min_ncut"), _POSITIVE),
     "kind": (0, 2),
-    **dict.fromkeys(("long_term_period", "recent_period", "negative_shares", "effective_samples"), _POSITIVE),
+    **dict.fromkeys(
+        ("long_term_period", "recent_period", "negative_shares", "effective_samples", "mark_gain"), _POSITIVE
+    ),
 }
 """{field of any record: smallest and largest value of its numbers}."""
 

@@ -221,8 +221,21 @@ def _check_tsbi(state: Any, path: str) -> None:  # noqa: ANN401
     require(is_sum, f"{path}.unexamined", state.unexamined, "what the probabilities of the hypotheses leave of 1")
     for hypothesis, one in own.items():
         _check_hypothesis_state(one, state, hypothesis_map(state.replica, hypothesis), f"{path}.hypothesis_states")
+    _check_marks(state, f"{path}.branching.marks")
     most = max(hypotheses)
     require(state.next_hypothesis > most, f"{path}.next_hypothesis", state.next_hypothesis, f"above {most}")
+
+
+def _check_marks(state: Any, path: str) -> None:  # noqa: ANN401
+    """Check that visits of marks are at keyframes with scans, in order."""
+    for name, visits in state.branching.marks.visits.items():
+        require(bool(visits), f"{path}.visits", shorten(name), "a mark that was visited")
+        missing = {visit.keyframe for visit in visits} - state.replica.scans.keys()
+        require(not missing, f"{path}.visits", shorten(sorted(missing)), "at keyframes with scans")
+        events = [event for visit in visits for event in (visit.first_event, visit.last_event)]
+        require(events == sorted(events), f"{path}.visits", shorten(events), "in the order of events")
+    for visit in (visit for visits in state.branching.marks.visits.values() for visit in visits):
+        _check_invertible(visit.pose.covariance, f"{path}.visits.pose.covariance")
 
 
 def _check_hypothesis_state(one: Any, state: Any, own: HypothesisMap, path: str) -> None:  # noqa: ANN401

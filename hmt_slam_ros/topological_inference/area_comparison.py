@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.topological_inference.candidate_gating import AreaCandidate, EntryPrior, Query, Transition
+from hmt_slam_ros.topological_inference.marks import AreaMark, MarkEntry
 
 ComparisonKind = Literal["cut", "recheck", "retry"]
 
@@ -69,6 +70,7 @@ class ExaminedArea(NamedTuple):
     :ivar modes: the ways in which they lie in it.
     :ivar agreements: of their surfaces with the area's map, one for each mode.
     :ivar is_pending: whether they fit best beside its place.
+    :ivar mark: whether they lie in it by a mark, if there is one.
     """
 
     area: int
@@ -77,6 +79,12 @@ class ExaminedArea(NamedTuple):
     modes: tuple[MatchMode, ...] = ()
     agreements: tuple[Agreement, ...] = ()
     is_pending: bool = False
+    mark: MarkEntry | None = None
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether they may lie in it."""
+        return self.entry.probability > 0.0 or (self.mark is not None and self.mark.probability > 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +100,7 @@ class OngoingComparison:
     :ivar examined: what was found in the others.
     :ivar negative_shares: matched shares in those that were tried.
     :ivar prepared: the area whose map was made at an earlier step, and which is matched next; else None.
+    :ivar marks: {area: mark that puts them there}.
     """
 
     query: Query
@@ -103,3 +112,4 @@ class OngoingComparison:
     examined: tuple[ExaminedArea, ...] = ()
     negative_shares: tuple[float, ...] = ()
     prepared: int | None = None
+    marks: Mapping[int, AreaMark] = field(default_factory=dict)

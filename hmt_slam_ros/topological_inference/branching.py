@@ -17,6 +17,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.shortest_path import (
     connected_neighbors,
     informative_arc,
@@ -48,6 +49,7 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import (
 )
 from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingPriors
 from hmt_slam_ros.topological_inference.map_search import MapSearch
+from hmt_slam_ros.topological_inference.marks import AreaMark, MarkEvidence, MarkMemory
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
 MIN_PROPOSAL_PROBABILITY = 0.5
@@ -82,11 +84,13 @@ class BranchingState:
     :ivar largest_area: the largest number that an area was given.
     :ivar search: what the closure search learned.
     :ivar unstored_scans: {keyframe event: scan} of scans that no map holds and that may still be matched.
+    :ivar marks: the visits of marks.
     """
 
     largest_area: int = FIRST_AREA
     search: SearchState = field(default_factory=SearchState)
     unstored_scans: Mapping[int, Scan] = field(default_factory=dict)
+    marks: MarkMemory = field(default_factory=MarkMemory)
 
 
 class Branching:
@@ -97,6 +101,7 @@ class Branching:
     :ivar map_search: searches the whole map for a lost robot.
     :ivar landmarks: their evidence on places and loops, where the configuration asks for it.
     :ivar unstored_scans: {keyframe event: scan} of scans that no map holds and that may still be matched.
+    :ivar marks: the visits of marks.
     :ivar options: parameters of the inference.
     :ivar kidnapping_priors: of a kidnapping before a keyframe event.
     """
@@ -118,6 +123,8 @@ class Branching:
         self.search = ClosureSearch(configuration, scans)
         self.map_search = MapSearch(configuration, scans, self.search.work)
         self.landmarks = None if landmarks is None else landmarks(configuration, scans)
+        self.marks = MarkMemory()
+        self._mark_evidence = MarkEvidence(configuration)
         self.options = configuration.tsbi
         self.kidnapping_priors = KidnappingPriors.from_configuration(configuration)
         self._filter = configuration.filter
@@ -128,7 +135,7 @@ class Branching:
     def state(self) -> BranchingState:
         """What is remembered between two events."""
         search = replace(self.search.state, region_maps=self.map_search.state)
-        return BranchingState(self.entry.largest_area, search, dict(self.unstored_scans))
+        return BranchingState(self.entry.largest_area, search, dict(self.unstored_scans), self.marks)
 
     def restore(self, state: BranchingState) -> None:
         """Start from a saved state."""
@@ -136,6 +143,7 @@ class Branching:
         self.search.restore(state.search)
         self.map_search.restore(state.search.region_maps)
         self.unstored_scans.update(state.unstored_scans)
+        self.marks = state.marks
 
     def localize_globally(
         self, parent: Parent, search: GlobalSearch, pose_hint: PoseHint | None = None
@@ -205,6 +213,30 @@ class Branching:
         if kidnapped is not None:
             log_ratio = max(0.0, log_ratio)
         return replace(parent, log_weight=parent.log_weight + log_ratio)
+
+    def reweight_by_marks(self, parent: Parent, pose: PoseGaussian, keyframe: int) -> Parent:
+        """The hypothesis with the evidence of the visits of marks that begin at the newest keyframe.
+
+        :param pose: belief over ``area_T_base``.
+        :param keyframe: its number.
+        """
+        log_likelihood = sum(
+            self._mark_evidence.log_likelihood(parent.hybrid_map, parent.area, pose, visit, before)
+            for visit, before in self.marks.beginning_visits(keyframe)
+        )
+        return replace(parent, log_weight=parent.log_weight + log_likelihood)
+
+    def leads_elsewhere(self, parent: Parent) -> bool:
+        """Whether a mark puts keyframes that were not compared into an area that is not joined to the robot's."""
+        own = parent.hybrid_map.keyframes(parent.area)
+        keyframes = [k for k in parent.state.unmatched_keyframes if k in own]
+        if not any(self.marks.repeated_visits(keyframes)):
+            return False
+        excluded = {*self._joined_areas(parent), *_searched_areas(parent)}
+        return bool(self._find_marked_areas(parent, self.entry.query(parent, keyframes), excluded))
+
+    def _find_marked_areas(self, parent: Parent, query: Query, excluded: Collection[int]) -> dict[int, AreaMark]:
+        return self._mark_evidence.find_areas(parent.hybrid_map, parent.area, query, self.marks, excluded)
 
     def cut(self, parent: Parent, keyframes: Sequence[int]) -> Branches:
         """Branch over a new area and every known area that the arcs admit, with one child per mode.
@@ -340,8 +372,9 @@ class Branching:
             self.options.max_candidates,
             max(MIN_EXAMINED_AREAS, math.ceil(self.options.max_comparisons * parent.probability)),
         )
+        marks = self._find_marked_areas(parent, query, excluded)
         return self.search.begin_comparison(
-            parent.hybrid_map, parent.area, query, parent.state.matched_keyframes, excluded, most, kind, only
+            parent.hybrid_map, parent.area, query, parent.state.matched_keyframes, excluded, most, kind, only, marks
         )
 
     def find_unlinked_overlap(self, parent: Parent, pose: Float64) -> int | None:

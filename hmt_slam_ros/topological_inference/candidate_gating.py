@@ -122,16 +122,20 @@ class CandidateGating:
         query: Query,
         matched: Mapping[int, Collection[int]],
         within: Mapping[int, PoseGaussian],
+        certain: Collection[int] = (),
     ) -> dict[int, AreaCandidate]:
         """The known areas within reach with which most of the query was not compared yet.
 
         :param matched: {known area: keyframes that were compared with it}.
         :param within: {known area: prior over ``area_T_reference``}.
+        :param certain: those that are candidates even where the arcs hardly admit them.
         """
         candidates = {}
         for area, prior in within.items():
             unmatched = {k: pose for k, pose in query.poses.items() if k not in matched.get(area, ())}
-            if 2 * len(unmatched) >= len(query.poses) and self._is_within_reach(hybrid_map, area, prior, unmatched):
+            if area in certain and 2 * len(unmatched) >= len(query.poses):
+                candidates[area] = AreaCandidate(prior, unmatched, 1.0)
+            elif 2 * len(unmatched) >= len(query.poses) and self._is_within_reach(hybrid_map, area, prior, unmatched):
                 positions = keyframe_positions(hybrid_map, area)
                 bound = sampled_entry_bound(positions, prior, stack_poses(unmatched), self._options.place_radius)
                 if bound > 0.0:

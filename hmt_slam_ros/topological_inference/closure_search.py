@@ -54,6 +54,13 @@ from hmt_slam_ros.topological_inference.event_work import CELL_WORK, EventWork
 from hmt_slam_ros.topological_inference.global_scan_matching import (
     query_bounds,
 )
+from hmt_slam_ros.topological_inference.marks import (
+    AreaMark,
+    MarkEntry,
+    fuse_with_mark,
+    mix_transition,
+    total_gain,
+)
 from hmt_slam_ros.topological_inference.place_recognition import (
     MIN_LOG_RATIO,
     NegativeSample,
@@ -208,6 +215,7 @@ class ClosureSearch:
         most: int,
         kind: ComparisonKind = "recheck",
         only: Collection[int] = (),
+        marks: Mapping[int, AreaMark] | None = None,
     ) -> OngoingComparison:
         """The comparison of keyframes with all admitted areas, before the first one.
 
@@ -216,12 +224,15 @@ class ClosureSearch:
         :param excluded: areas that are neither candidates nor part of a candidate's map.
         :param most: at most this many areas are examined, the most probable.
         :param only: the only areas to examine in a retry.
+        :param marks: {area: mark that puts them there}; these areas are examined first.
         """
         within, unexamined, elsewhere = self.gating.classify_areas(hybrid_map, area, query, excluded)
         if kind == "retry":
             within, unexamined = {known: prior for known, prior in within.items() if known in only}, {}
         self._places_ahead = [PlaceAhead(other, frozenset(excluded)) for other in elsewhere if within]
-        candidates = self.gating.candidates(hybrid_map, query, compared, within)
+        marks = {} if marks is None or kind == "retry" else marks
+        within |= {known: mark.prior for known, mark in marks.items() if known not in within}
+        candidates = self.gating.candidates(hybrid_map, query, compared, within, set(marks))
         ranked = sorted(candidates, key=lambda known: (-candidates[known].max_probability, known))
         return OngoingComparison(
             query,
@@ -229,7 +240,8 @@ class ClosureSearch:
             kind,
             {known: candidates[known] for known in ranked[:most]},
             {known: candidates[known].max_probability for known in ranked[most:]} | unexamined,
-            tuple(elsewhere),
+            tuple(known for known in elsewhere if known not in marks),
+            marks={known: mark for known, mark in marks.items() if known in candidates},
         )
 
     def continue_comparison(
@@ -262,7 +274,7 @@ class ClosureSearch:
         """
         if comparison.candidates:
             return next(iter(comparison.candidates))
-        is_in_some = any(one.entry.probability > 0.0 for one in comparison.examined)
+        is_in_some = any(one.is_possible for one in comparison.examined)
         is_sampled = max(comparison.query.poses) == self._newest_sampled
         return next(iter(comparison.elsewhere), None) if is_in_some and not is_sampled else None
 
@@ -270,9 +282,13 @@ class ClosureSearch:
         """The comparison after that with one area."""
         candidate = comparison.candidates[known]
         place = self._grid_cache.place(hybrid_map, known, comparison.excluded)
-        entry, modes = self._entry_probability(place, candidate), None
-        examined = ExaminedArea(known, candidate.prior, entry)
-        if entry.probability > 0.0:
+        mark, modes = comparison.marks.get(known), None
+        examined = ExaminedArea(known, candidate.prior, self._entry_probability(place, candidate))
+        if mark is not None:
+            candidate = self._narrow(candidate, mark)
+            by_mark = self._entry_probability(place, candidate._replace(prior=mark.joint_belief)).probability
+            examined = examined._replace(mark=MarkEntry(mark.belief, mark.mark_gain, by_mark))
+        if examined.is_possible:
             modes = self._modes(place, candidate)
             examined = examined._replace(is_pending=modes is None)
         if modes is not None:
@@ -294,15 +310,22 @@ class ClosureSearch:
 
     def _conclude(self, hybrid_map: HybridMap, comparison: OngoingComparison) -> AreaComparison:
         """Prior and evidence of all areas that were examined."""
-        examined = [one for one in comparison.examined if one.entry.probability > 0.0]
+        examined = [one for one in comparison.examined if one.is_possible]
         priors = {one.area: one.entry.probability for one in examined}
-        transition = transition_model(priors | dict(comparison.skipped), self._options.new_probability)
+        by_arcs = transition_model(priors | dict(comparison.skipped), self._options.new_probability)
+        marks = {one.area: one.mark for one in examined if one.mark is not None}
+        transition = mix_transition(by_arcs, marks, self._options.new_probability)
         newest = max(comparison.query.poses)
         if priors and newest != self._newest_sampled:
             self._newest_sampled = newest
             self._aliasing.add_negatives(comparison.negative_shares)
         in_order = sorted(examined, key=lambda one: (-one.entry.probability, one.area))
-        fits = [fit for one in in_order for fit in self._fits(hybrid_map, one, transition.known[one.area])]
+        total = total_gain(marks)
+        fits = [
+            fit
+            for one in in_order
+            for fit in self._fits(hybrid_map, one, transition.known[one.area], by_arcs.known[one.area] / total)
+        ]
         kept, dropped = _split_heaviest(fits, self._options.max_modes)
         skipped_weight = sum(transition.known[known] for known in comparison.skipped)
         skipped_weight += sum(math.exp(fit.log_weight) for fit in dropped)
@@ -320,6 +343,11 @@ class ClosureSearch:
 
     def _entry_probability(self, place: AreaPlace, candidate: AreaCandidate) -> EntryPrior:
         return entry_prior(place, candidate.prior, stack_poses(candidate.unmatched_poses), self._options.place_radius)
+
+    def _narrow(self, candidate: AreaCandidate, mark: AreaMark) -> AreaCandidate:
+        """A candidate that is searched by its mark, where the arcs to it are wide."""
+        is_wide_prior = is_wide(candidate.prior.covariance, self._filter)
+        return candidate._replace(prior=mark.joint_belief) if is_wide_prior else candidate
 
     def _negative_sample(self, hybrid_map: HybridMap, area: int, excluded: Collection[int]) -> NegativeSample:
         """An area's grid, and the pose of its middle keyframe."""
@@ -346,26 +374,33 @@ class ClosureSearch:
             return None
         return [mode for mode, area in zip(modes, areas, strict=True) if area == place.area]
 
-    def _fits(self, hybrid_map: HybridMap, examined: ExaminedArea, pi: float) -> Iterator[Fit]:
+    def _fits(self, hybrid_map: HybridMap, examined: ExaminedArea, pi: float, by_arcs: float = 0.0) -> Iterator[Fit]:
         """The weights of a candidate's modes.
 
         The modes share the probability of the place by their masses. A mode farther from the prior's mean than poses in
         the place usually are has less. Where a pending closure already puts the robot there, the fit was to be expected
-        even if that closure is false.
+        even if that closure is false. What a mark adds to the probability of the place the modes share by it.
 
         :param pi: prior of the place in the transition model, beside that by itself.
+        :param by_arcs: the part of it that no mark adds.
         """
         area, prior, entry, modes, agreements = examined[:5]
+        mark = examined.mark
+        mark_shares = [0.0] * len(modes) if mark is None else mark.shares(modes)
         is_expected = entry.probability > 0.5 and bool(hybrid_map.pending_closures)
         log_total_mass = float(np.logaddexp.reduce([mode.log_mass for mode in modes]) if modes else 0.0)
-        for mode, agreement in zip(modes, agreements, strict=True):
+        for mode, agreement, share in zip(modes, agreements, mark_shares, strict=True):
             log_evidence = MAP_IN_MAP.log_likelihood_ratio(agreement, MAPS_OUTLIER_RATE)
             log_evidence += self._aliasing.log_distinctiveness(agreement.matched_share, already_expected=is_expected)
             difference = se2.log(se2.between(prior.mean, mode.pose.mean))
             distance = float(difference @ np.linalg.solve(prior.covariance, difference))
             log_offset = -0.5 * max(0.0, distance - entry.median_mahalanobis2)
-            log_weight = math.log(pi) + mode.log_mass - log_total_mass + log_evidence + log_offset
-            yield Fit(area, mode, log_weight)
+            if mark is None:
+                yield Fit(area, mode, math.log(pi) + mode.log_mass - log_total_mass + log_evidence + log_offset)
+                continue
+            weight = by_arcs * math.exp(mode.log_mass - log_total_mass + log_offset) + (pi - by_arcs) * share
+            if weight > 0.0:
+                yield Fit(area, fuse_with_mark(mode, mark.belief), math.log(weight) + log_evidence)
 
 
 def known_ground_log_ratio(agreement: Agreement, clutter: float) -> float:

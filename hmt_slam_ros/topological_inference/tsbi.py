@@ -19,7 +19,7 @@ from hmt_slam_ros.hybrid_map.hypothesis_agreement import (
     merge_equivalent,
 )
 from hmt_slam_ros.hybrid_map.surroundings import areas_around, consistent_pose
-from hmt_slam_ros.messages.map_changes import AreaPose, LocalArea
+from hmt_slam_ros.messages.map_changes import AreaPose, LocalArea, PrunedKeyframe
 from hmt_slam_ros.messages.messages import (
     AreaEvent,
     AreaEvents,
@@ -46,6 +46,7 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import (
     normalize_and_reduce,
 )
 from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping, spawn_kidnapped_hypothesis
+from hmt_slam_ros.topological_inference.marks import Anchor, nearest_anchor
 from hmt_slam_ros.topological_inference.pose_distribution import (
     LocalizationStatus,
     PoseDistribution,
@@ -209,6 +210,20 @@ class Tsbi:
         self._state = replace(self._state, hypothesis_states=states)
         wanted = {event for state in states.values() for event in state.unstored_poses}
         self._branching.keep_scans(keyframe.sequence, keyframe.scan, wanted)
+        if keyframe.marks:
+            marks = self._branching.marks
+            self._branching.marks = marks.after_event(keyframe.sequence, keyframe.marks, self._anchor(keyframe))
+
+    def _anchor(self, keyframe: Keyframe) -> Anchor | None:
+        """The keyframe that observations of marks are relative to: this one if it is stored, or the nearest one."""
+        if any(estimate.stored for estimate in keyframe.estimates):
+            return Anchor(keyframe.sequence, np.zeros(3))
+        if len(self._replica.maps) > 1:
+            return None
+        estimate, hybrid_map = keyframe.estimates[0], self._replica.maps[self._replica.best_hypothesis]
+        if not hybrid_map.has_area(estimate.area):
+            return None
+        return nearest_anchor(hybrid_map, estimate.area, estimate.pose.mean)
 
     def _log_ratios(
         self, estimate: HypothesisEstimate, state: HypothesisState, keyframe: Keyframe
@@ -263,6 +278,8 @@ class Tsbi:
         is_waiting = bool(events.events) and any(child.state.comparison is not None for child in survivors)
         pruned = () if revised or is_reset or is_moved or is_waiting else events.redundant_keyframes
         stale_beams = () if revised or is_reset else keyframe.stale_beams
+        if pruned:
+            self._move_marks(pruned)
         answer = Hypotheses(events.sequence, tuple(hypotheses), reduced.unexamined, pruned, stale_beams)
         self._replica.apply_hypotheses(answer)
         if stale_beams:
@@ -271,6 +288,16 @@ class Tsbi:
         still_revised = revised if keyframe.motion_unknown else ()
         self._state = replace(self._state, unexamined=reduced.unexamined, revised_hypotheses=still_revised)
         return replace(answer, hypotheses=tuple(sorted(loaded, key=lambda hypothesis: hypothesis.id)))
+
+    def _move_marks(self, pruned: Sequence[PrunedKeyframe]) -> None:
+        """Let visits of marks at keyframes that are pruned from the only map be at the nearest one of the same area."""
+        hybrid_map = self._replica.maps[self._replica.best_hypothesis]
+        gone = {one.keyframe for one in pruned}
+        anchors = {
+            one.keyframe: nearest_anchor(hybrid_map, one.area, hybrid_map.keyframes(one.area)[one.keyframe], gone)
+            for one in pruned
+        }
+        self._branching.marks = self._branching.marks.without_keyframes(anchors)
 
     def _parents(self, keyframe: Keyframe) -> list[Parent]:
         """The live hypotheses with their weights; of equivalent ones the heaviest, with the weight of all."""
@@ -282,6 +309,10 @@ class Tsbi:
         parents = [
             self._branching.reweight_by_known_ground(parent, pose, points, keyframe.sequence, kidnapped)
             for parent, pose in zip(parents, poses, strict=True)
+        ]
+        parents = [
+            self._branching.reweight_by_marks(parent, self._estimates[parent.hypothesis].pose, keyframe.sequence)
+            for parent in parents
         ]
         localized = [
             LocalizedHypothesis(p.hybrid_map, p.area, pose, {p.area, *p.local_area_poses()})
@@ -379,7 +410,9 @@ class Tsbi:
         if state.unlinked_overlap is not None and state.unlinked_overlap[1] >= _OVERLAP_PERSISTENCE:
             return self._branching.entry.link(parent, state.unlinked_overlap[0], keyframe.scan, estimate.pose)
         unmatched = len(state.unmatched_keyframes)
-        is_recheck_due = unmatched >= self._options.recheck_keyframes
+        is_recheck_due = unmatched >= self._options.recheck_keyframes or (
+            unmatched >= _RETRY_KEYFRAMES and self._branching.leads_elsewhere(parent)
+        )
         if state.comparison is not None:
             # A search and a comparison that both go on take turns.
             is_recheck_due = keyframe.sequence % 2 == 0
@@ -470,6 +503,7 @@ class Tsbi:
         if decision.hypothesis is None:
             return
         self._replica.apply_decision(decision)
+        self._branching.marks = self._branching.marks.restricted_to(self._replica.scans)
         self._state = replace(
             self._state,
             revised_hypotheses=decision.revised_hypotheses,
