@@ -112,7 +112,12 @@ def _keyframes(log: Log, configuration: Configuration) -> tuple[Keyframes, list[
     for record in log.records():
         if isinstance(record.measurement, Odometry):
             readings.append(record.measurement)
-        elif readings and len(keyframes) < _KEYFRAMES and _is_due(keyframes, readings[-1].pose, configuration):
+        elif (
+            isinstance(record.measurement, Scan)
+            and readings
+            and len(keyframes) < _KEYFRAMES
+            and _is_due(keyframes, readings[-1].pose, configuration)
+        ):
             keyframes.append((record.measurement, readings[-1].pose))
     return keyframes, readings
 

@@ -18,7 +18,7 @@ from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.results.final_map import deskewed_scans, final_map
 from hmt_slam_ros.results.hmt_map import RunState
-from hmt_slam_ros.sensors import Odometry
+from hmt_slam_ros.sensors import Odometry, Scan
 
 POINTS = 24
 """Scans after which the state is kept, at most."""
@@ -83,6 +83,6 @@ def odometry_at_scans(records: Sequence[LogRecord]) -> Float64:
     for record in records:
         if isinstance(record.measurement, Odometry):
             last = record.measurement.pose
-        else:
+        elif isinstance(record.measurement, Scan):
             poses.append(last)
     return np.array(poses)

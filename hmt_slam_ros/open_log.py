@@ -32,6 +32,7 @@ def open_log(
     *,
     scan_topic: str = "/scan",
     odom_topic: str = "/odom",
+    marks_topic: str = "",
     start: float = 0.0,
     duration: float | None = None,
 ) -> Log:
@@ -40,6 +41,7 @@ def open_log(
     :param path: file or folder, or ``sim:WORLD,name=value,...`` for a simulated drive (docs/guides/simulation.md).
     :param scan_topic: topic of a bag; where the default is missing, the only topic with scans.
     :param odom_topic: topic of a bag, chosen likewise; without any, the transform odom -> base on /tf.
+    :param marks_topic: topic of a bag with observations of marks, empty for none.
     :param start: start of the part to read after the log's first stamp, s.
     :param duration: duration of that part, s, None for the rest.
     :raises HmtSlamError: where the file is missing, of unknown format, truncated or damaged, or lacks scans, odometry
@@ -52,11 +54,11 @@ def open_log(
         return open_simulated(path, window)
     path = Path(path)
     if path.is_dir():
-        return _open_bag(_bag_folder(path), window, scan_topic, odom_topic)
+        return _open_bag(_bag_folder(path), window, scan_topic, odom_topic, marks_topic)
     head = _read_head(path)
     for magic, suffix in ((_MCAP, ".mcap"), (_SQLITE, ".db3")):
         if head.startswith(magic):
-            return _open_bag(_check_suffix(path, suffix), window, scan_topic, odom_topic)
+            return _open_bag(_check_suffix(path, suffix), window, scan_topic, odom_topic, marks_topic)
     return _open_file(path, head, window)
 
 
@@ -71,10 +73,10 @@ def is_bag(path: str | Path) -> bool:
     return not is_simulated(path) and (path.is_dir() or _read_head(path).startswith((_MCAP, _SQLITE)))
 
 
-def _open_bag(path: Path, window: TimeWindow, scan_topic: str, odom_topic: str) -> Log:
+def _open_bag(path: Path, window: TimeWindow, scan_topic: str, odom_topic: str, marks_topic: str) -> Log:
     from hmt_slam_ros.logs.bag import BagLog  # noqa: PLC0415  the rosbags library takes memory
 
-    return BagLog(path, window, scan_topic, odom_topic)
+    return BagLog(path, window, scan_topic, odom_topic, marks_topic)
 
 
 def _open_file(path: Path, head: bytes, window: TimeWindow) -> Log:

@@ -19,6 +19,7 @@ class Purpose(IntEnum):
     WHEELS = 104
     LASER = 105
     CHANGES = 106
+    MARKS = 107
 
 
 def random_stream(seed: int, purpose: Purpose, step: int) -> np.random.Generator:

@@ -9,7 +9,7 @@ from hmt_slam_ros.cli.main import main
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.stamps import seconds_from_stamp
 from hmt_slam_ros.open_log import open_log
-from hmt_slam_ros.sensors import Odometry
+from hmt_slam_ros.sensors import Odometry, Scan
 
 _BUNDLED = ROOT / "data" / "malaga_one_loop"
 _SECONDS = "8"
@@ -88,7 +88,7 @@ def carmen_text(log: Path, start: float = 0.0, duration: float = 4.0) -> str:
         if isinstance(record.measurement, Odometry):
             pose = " ".join(f"{value:.6f}" for value in record.measurement.pose)
             lines.append(f"ODOM {pose} 0 0 0 {stamp} host 0\n")
-        else:
+        elif isinstance(record.measurement, Scan):
             ranges = " ".join(f"{value:.3f}" for value in record.measurement.ranges[::4])
             count = len(record.measurement.ranges[::4])
             lines.append(f"FLASER {count} {ranges} {pose} {pose} {stamp} host 0\n")

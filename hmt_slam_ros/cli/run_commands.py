@@ -99,7 +99,12 @@ def initial_state(options: argparse.Namespace, path: Path, source: Path | None) 
 
 def open_time_window(path: Path, configuration: Configuration) -> Log:
     """The part of a log that ``robot.start`` and ``robot.duration`` select."""
-    log = open_log(path, start=configuration.robot.start, duration=configuration.robot.duration or None)
+    log = open_log(
+        path,
+        marks_topic=configuration.marks.topic,
+        start=configuration.robot.start,
+        duration=configuration.robot.duration or None,
+    )
     if not log.scan_count:
         raise HmtSlamError(f"{path} has no scans in the part asked for: check --start and --duration")
     return log
@@ -163,7 +168,12 @@ def run_replay(options: argparse.Namespace) -> None:
     check_single_log(options)
     configuration = chosen_configuration(options)
     check_output(options.out, options.command)
-    log = open_log(options.log, start=configuration.robot.start, duration=configuration.robot.duration or None)
+    log = open_log(
+        options.log,
+        marks_topic=configuration.marks.topic,
+        start=configuration.robot.start,
+        duration=configuration.robot.duration or None,
+    )
     report_left_out(log, options.command)
     replay = load_replay().replay
     announce_page(options.view)

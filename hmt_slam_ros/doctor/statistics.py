@@ -294,10 +294,10 @@ class Gatherer:
         self._motions = ScanMotionFinder()
 
     def add(self, record: LogRecord) -> None:
-        """Add a scan or an odometry reading."""
+        """Add a scan or an odometry reading; observations of marks are passed over."""
         if isinstance(record.measurement, Scan):
             self._add_scan(record.source_stamp, record.measurement)
-        else:
+        elif isinstance(record.measurement, Odometry):
             self._add_odometry(record.source_stamp, record.measurement)
 
     def _add_odometry(self, source_stamp: int, reading: Odometry) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import struct
+from collections import deque
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.bag_files import BagMessage, check_bag, read_messages, read_topics
+from hmt_slam_ros.logs.mark_messages import mark_from_message
 from hmt_slam_ros.logs.mounting import FrameTree, Mounting, frame_name, heading_from_quaternion, planar_mounting
 from hmt_slam_ros.logs.records import LeftOut, LogRecord, TimeWindow, require_scans
 from hmt_slam_ros.logs.ros_types import (
@@ -22,12 +25,13 @@ from hmt_slam_ros.logs.ros_types import (
     LASER_SCAN,
     ODOMETRY,
     POSE,
+    POSE_WITH_COVARIANCE,
     TRANSFORMS,
     RosMessage,
     deserialize,
 )
 from hmt_slam_ros.logs.stamps import NANOSECONDS, running_stamps
-from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors import MarkObservation, Odometry, Scan
 from hmt_slam_ros.sensors.plausibility import (
     MAX_COORDINATE,
     check_odometry,
@@ -109,6 +113,29 @@ class _Measurement(NamedTuple):
     content: RosMessage
 
 
+class _BagMark(NamedTuple):
+    """An observation of a mark, with its bag time, ns."""
+
+    bag_time: int
+    observation: MarkObservation
+
+
+def _append_mark(marks: list[_BagMark], bag_time: int, message: RosMessage) -> None:
+    """Append the observation of a message.
+
+    :raises HmtSlamError: where it cannot be used.
+    """
+    marks.append(_BagMark(bag_time, mark_from_message(message)))
+
+
+def _mark_record(observation: MarkObservation, offset: int) -> LogRecord:
+    """The record of an observation.
+
+    :param offset: running clock less the clock of the headers, ns.
+    """
+    return LogRecord(observation.stamp, replace(observation, stamp=observation.stamp + offset))
+
+
 _MAX_LASERS, _MAX_FRAMES = 32, 2000
 """Frames of the scans of one topic, and of all transforms."""
 
@@ -127,10 +154,11 @@ class BagLog:
     :param window: part of the log to read.
     :param scan_topic: topic of the scans; the only LaserScan topic where the default does not exist.
     :param odom_topic: topic of the odometry, chosen likewise; without any, the transform odom -> base on /tf.
-    :raises HmtSlamError: where the bag is truncated or damaged, or lacks scans, odometry or the laser's transform.
+    :param marks_topic: topic of the observations of marks, empty for none.
+    :raises HmtSlamError: where the bag is truncated or damaged, or lacks scans, odometry, marks or a laser's transform.
     """
 
-    def __init__(self, path: Path, window: TimeWindow, scan_topic: str, odom_topic: str) -> None:
+    def __init__(self, path: Path, window: TimeWindow, scan_topic: str, odom_topic: str, marks_topic: str = "") -> None:
         check_bag(path)
         self._path = path
         self.left_out = LeftOut()
@@ -153,15 +181,39 @@ class BagLog:
         part = self._stamps[self._records_in_window]
         self.duration = float(part[-1] - part[0]) / NANOSECONDS
         self._true_poses = self._read_true_poses(topics)
+        self._marks = self._read_marks(topics, marks_topic) if marks_topic else []
         self._mountings = self._find_mountings(sorted({frame for _, _, frame in headers if frame is not None}))
 
     def records(self) -> Iterator[LogRecord]:
         """All measurements in file order."""
+        marks = deque(self._marks)
         for k, measurement in enumerate(itertools.compress(self._read_measurements(), self._kept)):
             if k >= self._records_in_window.stop:
                 return
+            stamp = int(self._stamps[k])
+            while marks and marks[0].bag_time <= measurement.bag_time:
+                mark = marks.popleft()
+                if k >= self._records_in_window.start:
+                    yield _mark_record(mark.observation, stamp - measurement.source_stamp)
             if k >= self._records_in_window.start:
-                yield self._make_record(measurement, int(self._stamps[k]))
+                yield self._make_record(measurement, stamp)
+
+    def _read_marks(self, topics: Mapping[str, str], topic: str) -> list[_BagMark]:
+        """The observations of marks that can be used.
+
+        :raises HmtSlamError: where the bag has no such topic.
+        """
+        if topics.get(topic) != POSE_WITH_COVARIANCE:
+            found = ", ".join(sorted(one for one, kind in topics.items() if kind == POSE_WITH_COVARIANCE))
+            raise HmtSlamError(
+                f"{self._path.name} has no topic {topic} of type {POSE_WITH_COVARIANCE}: set marks.topic to "
+                f"{found or 'nothing'}."
+            )
+        marks: list[_BagMark] = []
+        for message in read_messages(self._path, {topic}):
+            content = self._deserialize(message, POSE_WITH_COVARIANCE)
+            self.left_out.admits(partial(_append_mark, marks, message.bag_time, content))
+        return marks
 
     def _read_true_poses(self, topics: Mapping[str, str]) -> dict[int, NDArray[np.float64]]:
         """{source stamp, ns: true pose, shape (3,)}, {} where the bag has no ground truth."""

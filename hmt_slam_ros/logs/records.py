@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.stamps import NANOSECONDS, running_stamps
-from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors import Measurement, Odometry, Scan
 from hmt_slam_ros.sensors.plausibility import check_odometry, check_scan
 
 SIMULATION_PREFIX = "sim:"
@@ -28,20 +28,21 @@ class LogRecord:
     and the last stamp. Scans have increasing stamps, and so have odometry readings, 1 microsecond apart where the
     source does not advance. An odometry reading that belongs to a scan (the odometry fields of a CARMEN scan, the
     action before a rawlog's observation) has the stamp of the scan and comes directly before it. Records of a part of a
-    log have the stamps that they have in the whole log.
+    log have the stamps that they have in the whole log. An observation of a mark comes when it is known, and may have a
+    stamp before that of the record before it.
 
     :ivar source_stamp: the log's own stamp, ns, which may jump back; results are keyed by it.
-    :ivar measurement: the scan or odometry reading, with its ``stamp`` from the running clock, ns.
+    :ivar measurement: scan, odometry reading or observation of a mark, with its ``stamp`` from the running clock, ns.
     :ivar true_pose: shape (3,), the robot's true pose ``world_T_base``, m and rad; None where unknown.
     """
 
     source_stamp: int
-    measurement: Scan | Odometry
+    measurement: Measurement
     true_pose: NDArray[np.float64] | None = None
 
 
 class Log(Protocol):
-    """A source of scans and odometry that can be read more than once."""
+    """A source of scans, odometry and marks that can be read more than once."""
 
     @property
     def name(self) -> str:

@@ -15,9 +15,13 @@ LASER_SCAN = "sensor_msgs/msg/LaserScan"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 POSE = "geometry_msgs/msg/PoseStamped"
+POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 GROUND_TRUTH_TOPIC = "/ground_truth"
 """Topic of the robot's true poses in simulated bags."""
+
+MARKS_TOPIC = "/marks"
+"""Topic of the observations of marks in simulated bags."""
 
 RosMessage: TypeAlias = Any
 """A message of the rosbags library, which makes its classes at run time, so that type checkers know no fields."""

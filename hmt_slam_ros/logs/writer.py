@@ -14,20 +14,23 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.logs.mark_messages import message_covariance
 from hmt_slam_ros.logs.mcap_file import write_checksums
 from hmt_slam_ros.logs.records import Log, LogRecord
 from hmt_slam_ros.logs.ros_types import (
     GROUND_TRUTH_TOPIC,
     LASER_SCAN,
+    MARKS_TOPIC,
     ODOMETRY,
     POSE,
+    POSE_WITH_COVARIANCE,
     TRANSFORMS,
     RosMessage,
     typestore,
 )
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.own_files import ScratchFolder, replace_folder
-from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors import MarkObservation, Odometry, Scan
 
 ODOM_FRAME, BASE_FRAME, LASER_FRAME, WORLD_FRAME = "odom", "base_link", "laser", "world"
 
@@ -41,7 +44,8 @@ _NO_DEADLINE = QosTime(9223372036, 854775807)
 def write_bag(log: Log, destination: Path, *, storage: str = "mcap") -> None:
     """Write a log as a rosbag2 folder with /scan, /odom, /tf (odom -> base_link) and /tf_static (base_link -> laser).
 
-    Where the log has true poses, /ground_truth has ``world_T_base`` at every scan and odometry reading. The bag times
+    Where the log has true poses, /ground_truth has ``world_T_base`` at every scan and odometry reading. Where it
+    has observations of marks, they are on /marks. The bag times
     are those of the running clock, so they never jump back. Each header has the source stamp, from which a reader gets
     the log's own stamps and the same running clock. Angles become float32, the type of the message. Each laser pose of
     a log has a frame: laser, laser_1 and so on.
@@ -75,7 +79,7 @@ def write_bag(log: Log, destination: Path, *, storage: str = "mcap") -> None:
 
 
 def _write(log: Log, folder: Path, storage: StoragePlugin) -> None:
-    frames = _laser_frames(log)
+    frames, has_marks = _laser_frames(log)
     writer = Writer(folder, version=9, storage_plugin=storage)
     if storage == StoragePlugin.MCAP:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
@@ -85,6 +89,8 @@ def _write(log: Log, folder: Path, storage: StoragePlugin) -> None:
         types = {"/scan": LASER_SCAN, "/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS}
         if any(record.true_pose is not None for record in islice(log.records(), 1)):
             types[GROUND_TRUTH_TOPIC] = POSE
+        if has_marks:
+            types[MARKS_TOPIC] = POSE_WITH_COVARIANCE
         connections = {
             topic: writer.add_connection(topic, kind, typestore=typestore(), offered_qos_profiles=[_qos(topic)])
             for topic, kind in types.items()
@@ -125,14 +131,16 @@ def _qos(topic: str) -> Qos:
     )
 
 
-def _laser_frames(log: Log) -> dict[bytes, tuple[str, NDArray[np.float64]]]:
-    """{bytes of a laser pose: (name of its frame, pose)}, in the order of the first scans."""
+def _laser_frames(log: Log) -> tuple[dict[bytes, tuple[str, NDArray[np.float64]]], bool]:
+    """{bytes of a laser pose: (name of its frame, pose)}, in the order of first scans; and whether there are marks."""
     frames: dict[bytes, tuple[str, NDArray[np.float64]]] = {}
+    has_marks = False
     for record in log.records():
         if isinstance(record.measurement, Scan):
             pose = record.measurement.laser_pose
             frames.setdefault(pose.tobytes(), (f"{LASER_FRAME}_{len(frames)}" if frames else LASER_FRAME, pose))
-    return frames
+        has_marks = has_marks or isinstance(record.measurement, MarkObservation)
+    return frames, has_marks
 
 
 def _messages(
@@ -153,6 +161,8 @@ def _messages(
             yield "/odom", measurement.stamp, _odometry(source, measurement)
             transforms = [_transform(source, ODOM_FRAME, BASE_FRAME, measurement.pose)]
             yield "/tf", measurement.stamp, _message(TRANSFORMS, transforms=transforms)
+        elif isinstance(measurement, MarkObservation):
+            yield MARKS_TOPIC, measurement.stamp, _mark(source, measurement)
         else:
             frame, _ = frames[measurement.laser_pose.tobytes()]
             yield "/scan", measurement.stamp, _laser_scan(source, measurement, frame)
@@ -203,6 +213,15 @@ def _pose(pose: NDArray[np.float64]) -> RosMessage:
     """A geometry_msgs/Pose of a planar pose (3,)."""
     x, y, theta = pose.tolist()
     return _message("geometry_msgs/msg/Pose", position=_vector("Point", x, y), orientation=_rotation(theta))
+
+
+def _mark(stamp: int, observation: MarkObservation) -> RosMessage:
+    belief = _message(
+        "geometry_msgs/msg/PoseWithCovariance",
+        pose=_pose(observation.pose.mean),
+        covariance=message_covariance(observation.pose),
+    )
+    return _message(POSE_WITH_COVARIANCE, header=_header(stamp, observation.name), pose=belief)
 
 
 def _laser_scan(stamp: int, scan: Scan, frame: str) -> RosMessage:

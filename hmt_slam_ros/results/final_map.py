@@ -103,7 +103,7 @@ def deskewed_scans(log: Log, configuration: Configuration) -> Iterator[Scan]:
     for record in log.records():
         if isinstance(record.measurement, Odometry):
             odometry.add(record.measurement)
-        else:
+        elif isinstance(record.measurement, Scan):
             waiting.append(sweeps.check(record.measurement)[0])
         while waiting and (waiting[0].sweep_duration == 0.0 or odometry.covers(waiting[0].end_stamp)):
             yield _deskew_by_odometry(waiting.popleft(), odometry, configuration)

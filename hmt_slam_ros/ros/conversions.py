@@ -35,7 +35,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs.mounting import heading_from_quaternion
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.messages import ScanPoses
-from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors import MarkObservation, Odometry, Scan
+from hmt_slam_ros.sensors.mark import check_mark
 from hmt_slam_ros.sensors.plausibility import (
     MAX_COORDINATE,
     MAX_STAMP,
@@ -187,6 +188,15 @@ def gaussian_from_message(message: PoseWithCovariance) -> PoseGaussian:
     mean = pose_from_message(message.pose)
     axes = _rotation(mean[2])
     return PoseGaussian(mean, axes.T @ np.reshape(message.covariance, (6, 6))[_PLANAR] @ axes)
+
+
+def mark_from_message(message: PoseWithCovarianceStamped) -> MarkObservation:
+    """Observation of the mark after which the frame of a ROS pose is named.
+
+    :raises HmtSlamError: where it cannot be used; names the field, its value and the remedy.
+    """
+    stamp, name = stamp_from_time(message.header.stamp), message.header.frame_id.removeprefix("/")
+    return check_mark(MarkObservation(stamp, name, gaussian_from_message(message.pose)))
 
 
 def _rotation(theta: float) -> NDArray[np.float64]:

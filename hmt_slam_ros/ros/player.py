@@ -9,7 +9,7 @@ from dataclasses import replace
 from hmt_slam_ros.configuration.robot import RobotParameters
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors import Measurement, Odometry, Scan
 
 _LOOP_GAP = 100_000_000
 """Time between the last record of one pass and the first of the next, ns."""
@@ -38,7 +38,7 @@ class Player:
         self.is_paused = False
         self.scans_sent, self.readings_sent, self.stamp = 0, 0, 0
         self._records = _measurements(log, settings)
-        self._next_measurement: Scan | Odometry | None = next(self._records, None)
+        self._next_measurement: Measurement | None = next(self._records, None)
         self._last_due_time: float | None = None
         self._unacknowledged: deque[int] = deque()
         self.has_ended = self._next_measurement is None
@@ -75,7 +75,7 @@ class Player:
             return None
         return max(0.0, self._due_time(now) - now)
 
-    def take_next(self, now: float) -> Scan | Odometry:
+    def take_next(self, now: float) -> Measurement:
         """The next measurement."""
         assert self._next_measurement is not None
         measurement, due = self._next_measurement, self._due_time(now)
@@ -84,7 +84,7 @@ class Player:
         if isinstance(measurement, Scan):
             self.scans_sent += 1
             self._unacknowledged.append(measurement.stamp)
-        else:
+        elif isinstance(measurement, Odometry):
             self.readings_sent += 1
         self._next_measurement = next(self._records, None)
         self.has_ended = self._next_measurement is None
@@ -97,7 +97,7 @@ class Player:
         return self._last_due_time + (self._next_measurement.stamp - self.stamp) / NANOSECONDS / self.settings.rate
 
 
-def _measurements(log: Log, settings: RobotParameters) -> Iterator[Scan | Odometry]:
+def _measurements(log: Log, settings: RobotParameters) -> Iterator[Measurement]:
     """Measurements of the log, repeated where it loops, with increasing stamps."""
     shift = last = 0
     while True:

@@ -283,7 +283,12 @@ class ReplayRun:
             raise HmtSlamError("robot.drive = commands is for the robot node alone: set it to log for a replay")
         if configuration.robot.loop:
             raise HmtSlamError("robot.loop = true has no end to wait for: set it to false for a replay into a folder")
-        self._opened = open_log(log, start=configuration.robot.start, duration=configuration.robot.duration or None)
+        self._opened = open_log(
+            log,
+            marks_topic=configuration.marks.topic,
+            start=configuration.robot.start,
+            duration=configuration.robot.duration or None,
+        )
         if not self._opened.scan_count:
             raise HmtSlamError(f"{log} has no scans in the part asked for: check --start and --duration")
         self._log, self._contents = log, _read_contents(self._opened)

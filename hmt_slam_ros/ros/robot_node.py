@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, Twist
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import Odometry as OdometryMessage
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
@@ -53,7 +54,7 @@ from hmt_slam_ros.ros.topics import (
     SCAN,
     transform_publisher,
 )
-from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors import MarkObservation, Measurement, Odometry, Scan
 
 if TYPE_CHECKING:
     from hmt_slam_ros.simulation.driven_robot import DrivenRobot
@@ -160,6 +161,9 @@ class RobotNode(ConfiguredNode):
         self._compiling_at = -_COMPILING_MEMORY
         self._scans = self.create_publisher(LaserScan, SCAN, topics.LATCHED_SENSOR)
         self._readings = self.create_publisher(OdometryMessage, ODOM, topics.LATCHED_SENSOR)
+        self._marks: Publisher | None = None
+        if topic := self.configuration.marks.topic:
+            self._marks = self.create_publisher(PoseWithCovarianceStamped, topic, topics.LATCHED_SENSOR)
         self._clock_times = self.create_publisher(ClockMessage, CLOCK, topics.STREAM)
         self._statuses = self.create_publisher(String, ROBOT_STATUS, topics.LATCHED)
         self._send_transforms = transform_publisher(self, "tf")
@@ -193,7 +197,12 @@ class RobotNode(ConfiguredNode):
         if self._settings.drive == "commands":
             self._driven_robot = DrivenRobotSource(self, path, self._settings)
             return self._driven_robot
-        log = open_log(Path(path), start=self._settings.start, duration=self._settings.duration or None)
+        log = open_log(
+            Path(path),
+            marks_topic=self.configuration.marks.topic,
+            start=self._settings.start,
+            duration=self._settings.duration or None,
+        )
         if not log.scan_count:
             raise HmtSlamError(f"{path} has no scans in the part asked for: check robot.start and robot.duration")
         return log
@@ -271,12 +280,14 @@ class RobotNode(ConfiguredNode):
                 f"slam and rtl nodes, or set robot.{name}_listeners to 0"
             )
 
-    def _send(self, measurement: Scan | Odometry) -> None:
+    def _send(self, measurement: Measurement) -> None:
         self._last_progress = time.monotonic()
         self._clock_times.publish(ClockMessage(clock=conversions.time_message(measurement.stamp)))
         if isinstance(measurement, Scan):
             frame = self._announced_laser_frame(measurement)
             publish_reliably(self._scans, conversions.scan_message(measurement, frame), self.context)
+        elif isinstance(measurement, MarkObservation):
+            self._send_mark(measurement)
         else:
             frames = self._odom_frame, self._base_frame
             self._send_transforms([conversions.transform_message(measurement.stamp, *frames, measurement.pose)])
@@ -288,6 +299,11 @@ class RobotNode(ConfiguredNode):
         if self._player.has_ended:
             self._publish_status()
             self.get_logger().info(f"end of the log after {self._player.scans_sent} scans")
+
+    def _send_mark(self, observation: MarkObservation) -> None:
+        if self._marks is not None:
+            message = conversions.pose_with_covariance_message(observation.stamp, observation.name, observation.pose)
+            publish_reliably(self._marks, message, self.context)
 
     def _announced_laser_frame(self, scan: Scan) -> str:
         """The frame of a scan's laser; each new pose of a laser on the robot becomes a frame, which is published."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool, Trigger
 
 from hmt_slam_ros.configuration import Configuration
@@ -44,7 +45,7 @@ from hmt_slam_ros.ros.recovery import CHECKPOINT, ControlEvent, FrameMounting, P
 from hmt_slam_ros.ros.scan_intake import ScanIntake
 from hmt_slam_ros.ros.topics import INITIAL_POSE, PARTICLES
 from hmt_slam_ros.saved_map.folder import VERSION, FolderReader
-from hmt_slam_ros.sensors import Odometry, Scan
+from hmt_slam_ros.sensors import MarkObservation, Odometry, Scan
 
 if TYPE_CHECKING:
     from hmt_slam_ros.metric_slam.speculation import SpeculativeSlam
@@ -148,18 +149,24 @@ class SlamNode(MapServicesNode):
         self.create_service(SetBool, "~/pause", self._pause)
         self.create_timer(PERIOD, self._check_inputs, clock=self.diagnostics.steady_clock)
         self.create_subscription(PoseWithCovarianceStamped, INITIAL_POSE, self._on_initial_pose, topics.STREAM)
+        self._marks: Subscription | None = None
         self._deliver_initial_pose()
 
     def activate_node(self) -> None:
-        """As any process node; also subscribe to scans, of which missed ones come first where the robot kept them."""
+        """As any process node; also subscribe to marks and scans; missed scans come first where the robot kept them."""
         super().activate_node()
+        if topic := self.configuration.marks.topic:
+            self._marks = self.create_subscription(PoseWithCovarianceStamped, topic, self._on_mark, topics.SENSOR)
         self._scan_intake.start()
         self.deliver_ready_scans()
 
     def deactivate_node(self) -> None:
-        """As any process node; also unsubscribe from scans."""
+        """As any process node; also unsubscribe from scans and marks."""
         super().deactivate_node()
         self._scan_intake.stop()
+        if self._marks is not None:
+            self.destroy_subscription(self._marks)
+            self._marks = None
 
     def check_clean_up(self) -> None:
         """Check that no save or load is under way.
@@ -263,6 +270,17 @@ class SlamNode(MapServicesNode):
         self._scan_intake.discard_waiting()
         self.deliver(PoseReset(initial_pose))
 
+    def _on_mark(self, message: PoseWithCovarianceStamped) -> None:
+        """Deliver the observation of a mark, unless scans are passed over."""
+        try:
+            observation = conversions.mark_from_message(message)
+        except HmtSlamError as fault:
+            self.diagnostics.refuse(self.configuration.marks.topic, fault)
+            return
+        self.diagnostics.received[type(observation).__name__] += 1
+        if not self._scan_intake.is_paused:
+            self.deliver(observation)
+
     def deliver_ready_scans(self) -> None:
         """Deliver the scans whose laser's transform is known, and the end of the log after the last."""
         self._scan_intake.deliver_ready()
@@ -338,7 +356,7 @@ class SlamNode(MapServicesNode):
             self._scan_intake.pause(on=value.paused)
         elif isinstance(value, FrameMounting):
             self._mountings.restore(value)
-        elif isinstance(value, Scan | PoseReset | EndOfLog):
+        elif isinstance(value, Scan | MarkObservation | PoseReset | EndOfLog):
             if isinstance(value, Scan):
                 self._scan_intake.count_scan()
             self.deliver(value)

@@ -23,6 +23,7 @@ from hmt_slam_ros.simulation.drive import (
 )
 from hmt_slam_ros.simulation.furniture import change_since_first_visit, schedule_furniture
 from hmt_slam_ros.simulation.laser import Laser, WallIndex, clearance, wall_index
+from hmt_slam_ros.simulation.marks import CeilingMarks
 from hmt_slam_ros.simulation.people import draw_people
 from hmt_slam_ros.simulation.settings import Settings
 
@@ -102,6 +103,7 @@ class Scenario:
     :ivar drive: of the robot, without a kidnapping.
     :ivar laser: of the robot.
     :ivar people: in the building.
+    :ivar marks: on its ceiling.
     :ivar walls: of the building with its closed doors, without furniture.
     :ivar stamps: shape (n,), of the odometry readings, ns; every ``settings.readings``-th is a scan's as well.
     :ivar poses: shape (n, 3), ``world_T_base`` at these stamps, m and rad.
@@ -141,6 +143,8 @@ class Scenario:
         self._wheel_poses = self.poses
         if self._kidnapped_drive is not None:
             self._wheel_poses = self._kidnapped_drive.wheel_poses(self._seconds(self.stamps))
+        lap = np.linspace(0.0, self.drive.duration / settings.laps, settings.marks, endpoint=False)
+        self.marks = CeilingMarks(self.drive.poses(lap), self.poses[:: settings.readings], self.walls, settings)
         self.slips = self._draw_slips()
         self.odometry = self._odometry()
 

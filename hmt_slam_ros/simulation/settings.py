@@ -55,6 +55,10 @@ class Settings:
     moved: float = parameter(
         0.0, "Probability that a piece of furniture is moved while the robot does not see it.", low=0.0, high=1.0
     )
+    marks: int = parameter(0, "Marks with names on the ceiling, evenly along the first lap.", low=0, high=200)
+    wrong_marks: float = parameter(
+        0.0, "Share of the passes of a mark in which its name is read as that of another one.", low=0.0, high=1.0
+    )
     carried: float = parameter(
         0.0,
         "Share of the drive after which the robot is kidnapped, without odometry; 0 for never.",

@@ -131,13 +131,14 @@ class SimulatedLog:
         return shared_view(scenario.walls, scenario.laser, self.true_poses(stamps), self.true_poses(others))
 
     def records(self) -> Iterator[LogRecord]:
-        """All measurements in the order of time, each scan after the odometry of the same stamp."""
+        """All measurements in the order of time, each scan after the odometry and the marks of the same stamp."""
         scenario = self.scenario
         for k in range(self._part.start, self._part.stop):
             stamp, truth = int(scenario.stamps[k]), scenario.poses[k]
             yield LogRecord(stamp, Odometry(stamp, scenario.odometry[k]), truth)
             scan, between = divmod(k, scenario.settings.readings)
             if not between:
+                yield from (LogRecord(stamp, mark) for mark in scenario.marks.observe(scan, stamp))
                 yield LogRecord(stamp, scenario.scan(scan), truth)
 
 
