@@ -41,17 +41,19 @@ class World:
     """A simulated drive, and the seed of building, noise and run alike.
 
     :ivar family: one of ``FAMILIES``, or ``LONG``, or ``INSTITUTE``.
+    :ivar more: further settings of the world.
     """
 
     family: str
     seed: int
+    more: str = ""
 
     @property
     def log(self) -> str:
         """The name that ``open_simulated`` takes."""
         if self.family in _OTHERS:
             return _OTHERS[self.family].format(self.seed)
-        return ",".join(filter(None, (f"sim:{self.family},seed={self.seed}", SETTINGS[self.family])))
+        return ",".join(filter(None, (f"sim:{self.family},seed={self.seed}", SETTINGS[self.family], self.more)))
 
     @property
     def name(self) -> str:
