@@ -147,7 +147,7 @@ class TestJudgement:
         assert judge_answer("any", GridAnswer(), None).outcome == "none"
 
 
-def merged(family, verdict, *outcomes, is_foreign=False, is_right=True, overlap=20.0):
+def make_merged(family, verdict, *outcomes, is_foreign=False, is_right=True, overlap=20.0):
     answers = {"failed": GridAnswer(fault="it failed"), "none": GridAnswer()}
     programs = tuple(
         grid_programs.ProgramOutcome(f"program {n}", outcome, answers.get(outcome, GridAnswer((0.0, 0.0, 0.0), 1.0)))
@@ -160,11 +160,11 @@ def merged(family, verdict, *outcomes, is_foreign=False, is_right=True, overlap=
 
 def test_the_tables():
     found = [
-        merged("office", "joined", "right", "none"),
-        merged("office", "joined", "wrong", "right", is_right=False, overlap=9.0),
-        merged("office", "open", "none", "failed"),
-        merged("hall", "apart", "right", "right"),
-        merged("office", "joined", "wrong", "none", is_foreign=True, overlap=0.0),
+        make_merged("office", "joined", "right", "none"),
+        make_merged("office", "joined", "wrong", "right", is_right=False, overlap=9.0),
+        make_merged("office", "open", "none", "failed"),
+        make_merged("hall", "apart", "right", "right"),
+        make_merged("office", "joined", "wrong", "none", is_foreign=True, overlap=0.0),
     ]
     table = program_table(found, ["akaze", "orb"])
     assert "akaze: right, wrong, none, failed | orb: right, wrong, none, failed |" in table
