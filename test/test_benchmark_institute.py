@@ -66,7 +66,7 @@ def behind_door(node, pose):
     """A place behind a door that leads off where a node looks."""
     door = PoseGaussian(pose, np.eye(3))
     landmark = Landmark(OPENING, door, 0.9, 0.05, Existence(1.0))
-    return Destination(node, SideOpening(0, 0, landmark, door, NORTH, False, pose[:2]), pose[:2])
+    return Destination(node, SideOpening(0, 0, landmark, door, NORTH, False, pose[:2]), 0, pose[:2])
 
 
 def test_the_shortest_way_between_two_nodes():

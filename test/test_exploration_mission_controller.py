@@ -87,7 +87,7 @@ def test_a_robot_drives_into_a_room_and_from_there_to_another_door(known_buildin
     node = node_at(known_building, 10.0)
     opening = next(one for one in known_building.chart.nodes[node].openings if one.direction == goal.opening.direction)
     behind = se2.transform(opening.landmark.pose.mean, np.array([[1.2, 0.0]]))[0]
-    phases = list(dict.fromkeys(robot.go(Destination(node, opening, behind))))
+    phases = list(dict.fromkeys(robot.go(Destination(node, opening, 0, behind))))
     assert phases == [Phase.LEAVING, Phase.TURN, Phase.HALLWAY, Phase.DOOR, Phase.ROOM, Phase.THERE]
     assert math.dist(robot.pose[:2], (10.1, 2.2)) < 0.3
 
@@ -98,7 +98,7 @@ def test_a_robot_goes_from_a_room_to_the_one_behind_the_opposite_door(known_buil
         known_building.chart.nodes[node].openings, key=lambda one: (one.direction - eastwards(known_building)) % 4
     )
     south, north = (
-        Destination(node, one, se2.transform(one.landmark.pose.mean, np.array([[1.2, 0.0]]))[0]) for one in doors
+        Destination(node, one, 0, se2.transform(one.landmark.pose.mean, np.array([[1.2, 0.0]]))[0]) for one in doors
     )
     west = opposite_direction(eastwards(known_building))
     belief = certain_belief(known_building.graph, CONFIGURATION.places, state_of(node_at(known_building, 16.0), west))
@@ -210,7 +210,10 @@ def test_a_robot_that_is_out_of_a_room_where_it_went_in_has_got_on_and_turns_as_
     robot = Robot(MissionController(known_building, CONFIGURATION, LIMITS, belief), (10.0, 0.0, math.pi))
     assert list(robot.go(goal))[-1] is Phase.THERE
     robot.stamp += 10_000_000_000
-    phases, places = robot.go(Destination(node_at(known_building, 10.0), goal.opening, goal.position)), []
+    phases, places = (
+        robot.go(Destination(node_at(known_building, 10.0), goal.opening, goal.keyframe, goal.position)),
+        [],
+    )
     while next(phases) is not Phase.DOOR:
         places.append(robot.pose[0])
     assert min(places) > 4.0

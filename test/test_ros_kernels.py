@@ -19,7 +19,7 @@ from hmt_slam_ros.messages.documents import RobotStatus, decode
 from hmt_slam_ros.messages.messages import ClosureDecision
 from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.replay import RecorderNode
+from hmt_slam_ros.ros.recorder_node import RecorderNode
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, IS_LOCALIZED, MAP
 
 BUNDLED = Path(__file__).resolve().parent.parent / "data" / "malaga_one_loop"

@@ -14,7 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.process_table import RECORDER, node_names, process_names
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.replay import RecorderNode
+from hmt_slam_ros.ros.recorder_node import RecorderNode
 from hmt_slam_ros.ros.topics import DIAGNOSTICS
 
 ROOT = Path(__file__).resolve().parents[1]

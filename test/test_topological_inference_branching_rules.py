@@ -78,7 +78,7 @@ class GivenComparison:
 
     def begin_comparison(self, *given):
         self.requested.append(given)
-        _, _, query, _, excluded, _, kind, _ = given
+        _, _, query, _, excluded, _, kind, *_ = given
         return OngoingComparison(query, frozenset(excluded), kind, {}, {}, ())
 
     def continue_comparison(self, _hybrid_map, comparison):
@@ -170,7 +170,8 @@ def test_a_cut_branches_over_new_ground_and_every_fit_by_their_weights():
         expected = query.belief.compose(each.mode.measured.inverse())
         np.testing.assert_allclose(child.arcs[0].pose.mean, expected.mean)
         np.testing.assert_allclose(child.arcs[0].pose.covariance, expected.covariance)
-    hybrid_map, area, _, _, excluded, most, kind, only = given.requested[0]
+    hybrid_map, area, _, _, excluded, most, kind, only, marks = given.requested[0]
+    assert marks == {}
     assert (hybrid_map, area, excluded, kind, tuple(only)) == (parent.hybrid_map, 1, {0, 1}, "cut", ())
     assert most == 6  # 20 comparisons by the probability
     assert branching.entry.new_area(parent, query) == 7
@@ -209,7 +210,7 @@ def test_a_recheck_leaves_keyframes_where_they_are_and_joins_the_areas(only, fit
     assert stay.state.matched_keyframes == {6: frozenset(keyframes)}
     assert list(given.requested[0][2].poses) == keyframes
     assert given.requested[0][4] == {0, 1, 2}
-    assert given.requested[0][6:] == ("retry" if only else "recheck", only)
+    assert given.requested[0][6:] == ("retry" if only else "recheck", only, {})
     assert len(joined) == len(fits)
     for child in joined:
         assert (child.area, child.moved_keyframes, child.reload_local_map) == (1, (), True)

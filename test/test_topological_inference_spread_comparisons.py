@@ -76,6 +76,7 @@ def make_tsbi():
         entry=SimpleNamespace(move=lambda _parent, area: ("moved", area)),
         recheck=lambda _parent, *areas: ("rechecked", *areas),
         find_unlinked_overlap=lambda *_: None,
+        leads_elsewhere=lambda _parent: False,
     )
     return tsbi
 

@@ -88,7 +88,7 @@ def _nodes(run: Path, target: Path, loaded: Path | None) -> _Saving:
         RequestParticipant(node, name)
     slam: Any = SimpleNamespace(
         process=processes[COORDINATOR],
-        save_to=target,
+        get_parameter=lambda _name: SimpleNamespace(value=str(target)),
         estimate=document.last_estimate,
         unchanged_map_folder=loaded,
         _area_poses={entry.area: entry for entry in document.area_poses},
