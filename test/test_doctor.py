@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
@@ -11,13 +10,11 @@ import pytest
 from hmt_slam_ros.cli.main import main
 from hmt_slam_ros.doctor.examination import log_findings
 from hmt_slam_ros.doctor.frames import FrameTransform, MessageStatistics, ScanHeader, read_scan_header
-from hmt_slam_ros.doctor.running import NodeStatus, RunningSystem, Topic, running_findings
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.ros_types import LASER_SCAN, typestore
 from hmt_slam_ros.logs.writer import _header, write_bag
 from hmt_slam_ros.open_log import open_log
-from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.sensors import Scan
 
 WORLD = "sim:office,seed=3,beams=181,readings=4"
@@ -450,32 +447,3 @@ def test_the_command_says_what_is_wrong_and_returns_it(drive, tmp_path, capsys):
 def test_the_command_refuses_what_it_cannot_examine(arguments, capsys):
     assert main(["doctor", *arguments]) == 2
     assert capsys.readouterr().err.startswith("hmt_slam doctor: ")
-
-
-def test_nodes_that_compile_their_kernels_are_no_fault_of_a_running_system():
-    text = "compiling kernels, 40 s left"
-    statuses = tuple(NodeStatus(f"/{name}", 0, text, "inactive") for name in process_names())
-    topics = defaultdict(lambda: Topic(1, ("driver",)))
-    running = RunningSystem(1.0, topics, process_names(), (), statuses, {}, {}, "")
-    findings = list(running_findings(running))
-    assert {finding.severity for finding in findings} <= {"fine"}
-    assert any(f"/slam: {text}; " in finding.text for finding in findings)
-    waiting = replace(running, topics=defaultdict(lambda: Topic(0, ("robot",))))
-    findings = list(running_findings(waiting))
-    assert {finding.severity for finding in findings} == {"fine"}
-    assert "robot sends nothing on scan until the kernels are compiled." in [finding.text for finding in findings]
-    driven = replace(running, topics=defaultdict(lambda: Topic(0, ("driver",))))
-    assert "wrong" in {finding.severity for finding in running_findings(driven)}
-
-
-def test_nodes_without_a_system_that_run_twice_are_named():
-    topics = defaultdict(lambda: Topic(1, ("driver",)))
-    running = RunningSystem(1.0, topics, (*process_names(), "rtl"), (), (), {}, {}, "")
-    findings = [finding for finding in running_findings(running) if finding.severity == "wrong"]
-    assert [(finding.subject, finding.text) for finding in findings] == [
-        (
-            "two systems",
-            "rtl runs twice in this namespace (a killed node counts for 20 s): end all but one, or give each system a "
-            "namespace or a ROS_DOMAIN_ID of its own.",
-        )
-    ]

@@ -113,8 +113,9 @@ class PlacementSearch:
         for key, earlier in self._searches.items():
             window = self._outdated.pop(key, None)
             own = earlier if window is None else self._continue_search(window, earlier)
-            if own.is_checked or own.search is None:
+            if own.is_checked:
                 continue
+            assert own.search is not None
             self._work.begin_event()
             if len(own.search.unexamined) > own.left:
                 self._searches[key] = replace(own, search=self._map_search.continue_search(hybrid_map, own.search))
