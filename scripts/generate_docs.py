@@ -139,6 +139,7 @@ _MESSAGE_TOPICS = {
     "Scan": ("scan",),
     "Odometry": ("odom",),
     "MarkObservation": ("marks",),
+    "PlaceStatement": ("statement",),
     "PoseReset": ("initialpose",),
     "EndOfLog": ("hmt/robot_status",),
     "Keyframe": ("hmt/keyframes", "hmt/keyframe_scans"),
@@ -166,7 +167,7 @@ _FURTHER_PUBLISHED: dict[str, tuple[str, ...]] = {
     "explorer": _TASK_TOPICS,
     "pilot": (*_TASK_TOPICS, "pilot/place_estimate", "initialpose"),
     "view": ("hmt/incidents",),
-    "operator": ("initialpose", "rendezvous", "explorer/task", "pilot/task"),
+    "operator": ("initialpose", "statement", "rendezvous", "explorer/task", "pilot/task"),
 }
 """{node: topics that follow from no message of the process table}."""
 

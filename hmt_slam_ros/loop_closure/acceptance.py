@@ -164,7 +164,7 @@ class PendingArc:
     """An arc that TSBI set and that is not definite yet.
 
     :ivar event: at which it was observed.
-    :ivar near: the robot's area before that event.
+    :ivar near: the robot's area before that event, or the source of an arc that is not of the robot's area.
     :ivar source: area a.
     :ivar target: area b, the one that the robot entered.
     :ivar pose: belief over ``a_T_b`` as observed.
@@ -208,6 +208,7 @@ def pending_arc(arc: Arc, hypothesis: Hypothesis, event: int, near: int, hybrid_
     value, before = hybrid_map.arc_value(source, target), hybrid_map.arc(source, target)
     replaced = None if value is None or before is None else Arc(source, target, before, value.closure)
     joined = tuple(sorted(moved.keyframe for moved in hypothesis.moved_keyframes if moved.area == target))
+    near = near if near in (source, target) else arc.source
     return PendingArc(event, near, source, target, pose, arc.closure, replaced, joined, frozenset(joined or [event]))
 
 

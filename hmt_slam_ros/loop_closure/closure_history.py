@@ -22,6 +22,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, AreaPair, HybridMap, area_pair
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.messages.map_changes import AreaMerge
+from hmt_slam_ros.messages.statements import WeighedStatement
 
 Pose = Float64
 
@@ -168,6 +169,7 @@ class AcceptedPath:
     :ivar area: the robot's area.
     :ivar pose: shape (3,), ``area_T_base``.
     :ivar frame_change: ``area_T_former``, shape (3,), if a withdrawal changed the robot's area or pose.
+    :ivar statements: what people stated about places.
     """
 
     hybrid_map: HybridMap
@@ -176,6 +178,7 @@ class AcceptedPath:
     area: int
     pose: Pose
     frame_change: Pose | None = None
+    statements: tuple[WeighedStatement, ...] = ()
 
     def with_robot_in(self, area: int, frame_change: Pose) -> AcceptedPath:
         """The path with the robot in another area or frame.

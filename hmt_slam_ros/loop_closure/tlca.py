@@ -33,6 +33,7 @@ from hmt_slam_ros.loop_closure.foreign_ground import ForeignNumbers, GroundTaker
 from hmt_slam_ros.messages.map_changes import Arc, AreaPose, ForeignGround, MovedKeyframe
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, Keyframe, Message, Notice
 from hmt_slam_ros.messages.replica import FIRST_AREA, FIRST_HYPOTHESIS, Replica, ReplicaState
+from hmt_slam_ros.messages.statements import StatementEvidence
 from hmt_slam_ros.messages.team import JoinedGround
 
 FrameKey = tuple[int, int, int]
@@ -168,7 +169,9 @@ class Tlca:
         self._acceptance = Acceptance(configuration)
         self._replica = Replica.from_state(state.replica)
         self._gate = chi_square_gate(configuration.tsbi.gate_probability)
-        self._closure_revision = ClosureRevision(self._options, state.closure_revision)
+        self._closure_revision = ClosureRevision(
+            self._options, state.closure_revision, StatementEvidence(configuration.tsbi)
+        )
         self._ambiguity = PoseAmbiguity(state.area_frames)
         self._disambiguation = Disambiguation(configuration)
         self._neighborhood = Neighborhood(configuration.tsbi.local_sigma, configuration.tsbi.local_reach)
@@ -219,7 +222,7 @@ class Tlca:
         paths = {h: self._count_dominance(path, self.supports[h]) for h, path in paths.items()}
         self._state, self._new_closures = replace(self._state, paths=paths, poses=poses), frozenset()
         ground = self._take_over_ground(hypotheses)
-        definite = self._dominant_hypothesis()
+        definite = self._dominant_hypothesis(is_lost=any(hypothesis.lost for hypothesis in hypotheses.hypotheses))
         arcs, moved = ((), ()) if definite is None else self._accept_path(definite)
         decision = ClosureDecision(hypotheses.sequence, definite, arcs, moved, foreign_ground=ground)
         self._replica.apply_decision(decision)
@@ -294,7 +297,7 @@ class Tlca:
         return [self._disambiguation.ambiguity(sequence, self._replica, poses)]
 
     def _revision_request(self, hypothesis: int, event: int) -> RevisionRequest | None:
-        """The request to revise closures that have just been accepted, if they are inconsistent."""
+        """The request to revise closures that are inconsistent, or that a statement contradicts."""
         path = self._state.paths[hypothesis]
         accepted = AcceptedPath(
             self._replica.maps[hypothesis],
@@ -302,8 +305,12 @@ class Tlca:
             path.closures,
             self._replica.robot_areas[hypothesis],
             self._state.poses[hypothesis],
+            statements=self._replica.statements,
         )
-        return self._closure_revision.check(event, accepted, self._new_closures, hypothesis)
+        request = self._closure_revision.check(event, accepted, self._new_closures, hypothesis)
+        if request is None and len(self._state.paths) == 1 and self._is_mapping:
+            request = self._closure_revision.check_statements(event, accepted, hypothesis)
+        return request
 
     def _updated_path(self, hypothesis: Hypothesis, sequence: int) -> TopologicalPath:
         """The path after TSBI's answer, which the maps do not contain yet."""
@@ -331,11 +338,18 @@ class Tlca:
             path = replace(path, history=(*path.history, step))
         return replace(path, pending_arcs=path.pending_arcs + pending)
 
-    def _dominant_hypothesis(self) -> int | None:
-        """The hypothesis that becomes definite now, if any; of several the most probable."""
+    def _dominant_hypothesis(self, *, is_lost: bool) -> int | None:
+        """The hypothesis that becomes definite now, if any; of several the most probable.
+
+        Closures of a definite path come into question again where a statement is due.
+
+        :param is_lost: whether the robot is, under one of them.
+        """
         paths, best = self._state.paths, self._replica.best_hypothesis
         if len(paths) == 1:
-            return None if paths[best].is_definite else best
+            due = self._closure_revision.due_statement(self._replica.statements)
+            is_in_question = due is not None and self._is_mapping and not is_lost
+            return None if paths[best].is_definite and not is_in_question else best
         lasting = [h for h, path in paths.items() if self._has_dominated(path)]
         return max(lasting, key=lambda h: (self._replica.probabilities[h], -h), default=None)
 

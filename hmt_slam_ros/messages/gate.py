@@ -29,6 +29,7 @@ from hmt_slam_ros.messages.documents import (
     decode_with_reset,
 )
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe
+from hmt_slam_ros.messages.statements import check_statement
 from hmt_slam_ros.messages.system_name import SystemName
 from hmt_slam_ros.messages.team import (
     MAX_TEAM_AREAS,
@@ -261,6 +262,11 @@ def _check_hypotheses(message: Hypotheses) -> None:
     for probability in (*probabilities, message.unexamined, sum(probabilities)):
         is_one = -_TOLERANCE <= probability <= 1.0 + _TOLERANCE
         _require(is_one, "probability", probability, "between 0 and 1, as their sum")
+    for weighed in message.statements:
+        check_statement(weighed.statement)
+        _require(0.0 <= weighed.probability <= 1.0, "probability", weighed.probability, "between 0 and 1")
+        for keyframe in (weighed.first_keyframe, weighed.second_keyframe):
+            _require(keyframe != NO_KEYFRAME, "keyframe", keyframe, "a keyframe")
 
 
 def _check_looks(message: Ambiguity) -> None:

@@ -30,6 +30,7 @@ from hmt_slam_ros.messages.map_changes import (
     PrunedKeyframe,
     StaleBeams,
 )
+from hmt_slam_ros.messages.statements import PlaceStatement, WeighedStatement
 from hmt_slam_ros.messages.tasks import GoalPose, PlaceEstimate, Task, TaskResult, VelocityCommand
 from hmt_slam_ros.messages.team import JoinedGround, TeamMessage
 from hmt_slam_ros.registration.consistency import Clutter
@@ -183,6 +184,7 @@ class Hypotheses:
     :ivar unexamined: probability of topologies that the gate excluded or the reduction dropped.
     :ivar pruned_keyframes: keyframes that are removed from all maps, after all other changes.
     :ivar stale_beams: beams that are removed from keyframes' scans.
+    :ivar statements: what people stated about places, in order, each with its probability now.
     """
 
     sequence: int
@@ -190,6 +192,7 @@ class Hypotheses:
     unexamined: float = 0.0
     pruned_keyframes: tuple[PrunedKeyframe, ...] = ()
     stale_beams: tuple[StaleBeams, ...] = ()
+    statements: tuple[WeighedStatement, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -380,6 +383,7 @@ Message = (
     Scan
     | Odometry
     | MarkObservation
+    | PlaceStatement
     | Keyframe
     | AreaEvents
     | Hypotheses

@@ -12,6 +12,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import CommonMap, GraphState, HybridMap
 from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, AreaPose, ForeignGround, MovedKeyframe
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, Keyframe
+from hmt_slam_ros.messages.statements import WeighedStatement
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.scan import BeamRevision
 
@@ -35,6 +36,7 @@ class ReplicaState:
     :ivar changes: {hypothesis: areas and arcs that differ from ``common``}.
     :ivar probabilities: {hypothesis: P(gamma^t | d)}.
     :ivar robot_areas: {hypothesis: the robot's area}.
+    :ivar statements: what people stated about places, in order.
     """
 
     scans: Mapping[int, Scan] = field(default_factory=dict)
@@ -43,6 +45,7 @@ class ReplicaState:
     changes: Mapping[int, GraphState] = field(default_factory=lambda: {FIRST_HYPOTHESIS: GraphState.empty()})
     probabilities: Mapping[int, float] = field(default_factory=lambda: {FIRST_HYPOTHESIS: 1.0})
     robot_areas: Mapping[int, int] = field(default_factory=lambda: {FIRST_HYPOTHESIS: FIRST_AREA})
+    statements: tuple[WeighedStatement, ...] = ()
 
 
 @dataclass
@@ -54,6 +57,7 @@ class Replica:
     :ivar probabilities: {hypothesis: P(gamma^t | d)}.
     :ivar robot_areas: {hypothesis: the robot's area}.
     :ivar contested: keyframes that were stored while there were several hypotheses, perhaps under some of them only.
+    :ivar statements: what people stated about places, in order.
     """
 
     scans: dict[int, Scan] = field(default_factory=dict)
@@ -61,6 +65,7 @@ class Replica:
     probabilities: dict[int, float] = field(default_factory=lambda: {FIRST_HYPOTHESIS: 1.0})
     robot_areas: dict[int, int] = field(default_factory=lambda: {FIRST_HYPOTHESIS: FIRST_AREA})
     contested: set[int] = field(default_factory=set)
+    statements: tuple[WeighedStatement, ...] = ()
     _recent_scans: deque[Scan] = field(default_factory=deque)
 
     @classmethod
@@ -78,7 +83,8 @@ class Replica:
         }
         definite = {keyframe for keyframes in common.areas.values() for keyframe in keyframes}
         contested = state.scans.keys() - definite
-        return cls(dict(state.scans), maps, dict(state.probabilities), dict(state.robot_areas), contested)
+        probabilities, areas = dict(state.probabilities), dict(state.robot_areas)
+        return cls(dict(state.scans), maps, probabilities, areas, contested, state.statements)
 
     @property
     def state(self) -> ReplicaState:
@@ -94,6 +100,7 @@ class Replica:
             },
             dict(self.probabilities),
             dict(self.robot_areas),
+            self.statements,
         )
 
     @property
@@ -136,6 +143,7 @@ class Replica:
         self.maps = {h.id: self._child_map(h) for h in hypotheses.hypotheses}
         self.probabilities = {h.id: h.probability for h in hypotheses.hypotheses}
         self.robot_areas = {h.id: h.area for h in hypotheses.hypotheses}
+        self.statements = hypotheses.statements
         for stale in hypotheses.stale_beams:
             if stale.keyframe in self.scans:
                 revision = BeamRevision(stale.removed, stale.occluded, stale.starts)

@@ -9,6 +9,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import AreaPair, HybridMap
 from hmt_slam_ros.messages.map_changes import Pose
 from hmt_slam_ros.messages.replica import Replica
+from hmt_slam_ros.messages.statements import WeighedStatement
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -74,6 +75,7 @@ class Topology:
     :ivar pose: shape (3,), ``area_T_base`` of the robot at the newest keyframe event, m and rad.
     :ivar areas: ordered by id. An area that has no pose in the map yet is left out until it has one.
     :ivar arcs: all arcs between these areas, ordered by their ends.
+    :ivar statements: what people stated about places, in order, each with its probability.
     """
 
     events: int
@@ -85,6 +87,7 @@ class Topology:
     pose: Pose
     areas: tuple[TopologyArea, ...]
     arcs: tuple[TopologyArc, ...]
+    statements: tuple[WeighedStatement, ...]
 
     @classmethod
     def from_replica(
@@ -122,6 +125,7 @@ class Topology:
                 for a, b, arc in hybrid_map.all_arcs()
                 if a in area_poses and b in area_poses
             ),
+            replica.statements,
         )
 
 

@@ -13,9 +13,11 @@ from std_msgs.msg import Bool, Float64, Float64MultiArray, String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.ambiguity import Ambiguity
 from hmt_slam_ros.messages.documents import encode
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Message, RealTimePose, TrackingReset
+from hmt_slam_ros.messages.statements import parse_statement
 from hmt_slam_ros.messages.topology import Topology
 from hmt_slam_ros.real_time_localization.rtl import CorrectionSmoother
 from hmt_slam_ros.ros import topics
@@ -45,6 +47,7 @@ from hmt_slam_ros.ros.topics import (
     PATH,
     PMF,
     POSE,
+    STATEMENT,
     transform_publisher,
 )
 from hmt_slam_ros.saved_map.folder import VERSION, FolderReader
@@ -63,16 +66,17 @@ _DRAWING_PERIOD, _DATA_PERIOD = 2.9, 0.9
 
 
 class TsbiNode(ProcessNode):
-    """The node ``tsbi``: the distribution of Eq. (14), and whether the robot is localized."""
+    """The node ``tsbi``: the distribution of Eq. (14), whether the robot is localized, and statements of people."""
 
     process: Tsbi
 
     def configure_node(self) -> None:
-        """As any process node; also publish whether the robot is localized."""
+        """As any process node; also publish whether the robot is localized, and subscribe to statements of people."""
         super().configure_node()
         self._pmf = self.create_publisher(Float64MultiArray, PMF, topics.LATCHED)
         self._localized_publisher = self.create_publisher(Bool, IS_LOCALIZED, topics.LATCHED)
         self._entropy_publisher = self.create_publisher(Float64, ENTROPY, topics.LATCHED)
+        self.create_subscription(String, STATEMENT, self._on_statement, topics.STREAM)
         self._publish_localization()
 
     def publish_views(self, message: Message, outputs: list[Message]) -> None:
@@ -82,6 +86,15 @@ class TsbiNode(ProcessNode):
         for output in outputs:
             if isinstance(output, Hypotheses):
                 self._pmf.publish(pmf_message(output))
+
+    def _on_statement(self, message: String) -> None:
+        """Deliver what a person states about two areas."""
+        try:
+            statement = parse_statement(message.data)
+        except HmtSlamError as fault:
+            self.diagnostics.refuse(STATEMENT, fault)
+            return
+        self.inbox.receive(statement)
 
     def reset(self, folder: str, reset_number: int = 0) -> None:
         """As any process node; also publish that the robot is not localized."""

@@ -77,6 +77,7 @@ IS_LOCALIZED, ENTROPY = "hmt/is_localized", "hmt/entropy"
 AMBIGUITY_GOAL = "hmt/ambiguity_goal"
 INITIAL_POSE = "initialpose"
 RENDEZVOUS = "rendezvous"
+STATEMENT = "statement"
 DIAGNOSTICS, AGGREGATED = "diagnostics", "/diagnostics"
 INCIDENTS = "hmt/incidents"
 

@@ -173,6 +173,8 @@ _LIMITS: Mapping[str, tuple[float, float]] = {
     **dict.fromkeys(("members", "mode_count", "kidnappings", "first_event", "last_event"), _NUMBER),
     **dict.fromkeys(("unreported", "beams", "hypothesis", "graph", "map_sizes", "checksum"), _NUMBER),
     **dict.fromkeys(("keyframes", "keyframe", "anchor", "second_keyframes"), _KEYFRAME),
+    **dict.fromkeys(("first_keyframe", "second_keyframe"), _KEYFRAME),
+    **dict.fromkeys(("number", "compared_statement", "examined_statement"), _NUMBER),
     **dict.fromkeys(("event", "id", "parent", "hypotheses", "since", "published_change"), _NUMBER_OR_NONE),
     **dict.fromkeys(("requested_at", "newest_sampled", "scans", "areas"), _NUMBER_OR_NONE),
     **dict.fromkeys(("stamp", "stamps", "source_stamps", "last_stamp", "begin", "end", "clock_offset"), _STAMP),
@@ -185,6 +187,7 @@ _LIMITS: Mapping[str, tuple[float, float]] = {
     ),
     **dict.fromkeys(("inliers", "outliers", "distance", "angle", "periods", "last_interval", "min_ncut"), _POSITIVE),
     "kind": (0, 2),
+    "reliability": (0.5, 0.999),
     **dict.fromkeys(
         ("long_term_period", "recent_period", "negative_shares", "effective_samples", "mark_gain"), _POSITIVE
     ),

@@ -12,7 +12,20 @@ from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.topological_inference.candidate_gating import AreaCandidate, EntryPrior, Query, Transition
 from hmt_slam_ros.topological_inference.marks import AreaMark, MarkEntry
 
-ComparisonKind = Literal["cut", "recheck", "retry"]
+ComparisonKind = Literal["cut", "recheck", "retry", "stated"]
+
+
+class StatedPair(NamedTuple):
+    """Two areas that a person states to be one place.
+
+    :ivar statement: number of the statement.
+    :ivar area: the area whose keyframes are compared.
+    :ivar other: the area with which they are.
+    """
+
+    statement: int
+    area: int
+    other: int
 
 
 class Fit(NamedTuple):
@@ -91,9 +104,10 @@ class ExaminedArea(NamedTuple):
 class OngoingComparison:
     """A comparison of keyframes with known areas before its end.
 
-    :ivar query: the keyframes, in the robot's area.
+    :ivar query: the keyframes, in the robot's area, or in that of the stated pair.
     :ivar excluded: areas that are neither candidates nor part of a candidate's map.
-    :ivar kind: of a cut, of a recheck with all areas that the arcs admit, or of a retry with some of them.
+    :ivar kind: of a cut, of a recheck with all areas that the arcs admit, of a retry with some of them, or of two areas
+        that a person states to be one place.
     :ivar candidates: {area: its prior} of those that were not examined yet, the most probable first.
     :ivar skipped: {area: bound on its probability} of those that are not examined.
     :ivar elsewhere: some areas in which the keyframes surely do not lie, without those that were tried.
@@ -101,6 +115,7 @@ class OngoingComparison:
     :ivar negative_shares: matched shares in those that were tried.
     :ivar prepared: the area whose map was made at an earlier step, and which is matched next; else None.
     :ivar marks: {area: mark that puts them there}.
+    :ivar stated_pair: the two areas that a person states to be one place; else None.
     """
 
     query: Query
@@ -113,3 +128,4 @@ class OngoingComparison:
     negative_shares: tuple[float, ...] = ()
     prepared: int | None = None
     marks: Mapping[int, AreaMark] = field(default_factory=dict)
+    stated_pair: StatedPair | None = None

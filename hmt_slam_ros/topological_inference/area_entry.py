@@ -31,6 +31,7 @@ class AreaEntry:
     """Makes the children that enter an area, and numbers new areas.
 
     :ivar largest_area: the largest number that an area was given.
+    :ivar covariance_floor: covariance of a keyframe's pose at least, shape (3, 3).
     """
 
     def __init__(self, configuration: Configuration, replica: Replica, search: ClosureSearch) -> None:
@@ -38,7 +39,7 @@ class AreaEntry:
         self._replica = replica
         self._search = search
         sigma, angle = configuration.tlca.arc_sigma_floor, math.radians(configuration.tlca.arc_angle_floor)
-        self._covariance_floor = np.diag([sigma**2, sigma**2, angle**2])
+        self.covariance_floor = np.diag([sigma**2, sigma**2, angle**2])
         self.largest_area = FIRST_AREA
         self._new_areas: dict[tuple[int, ...], int] = {}
 
@@ -61,7 +62,7 @@ class AreaEntry:
         """
         poses, first = parent.hybrid_map.keyframes(parent.area), keyframes[0] if first is None else first
         reference = poses[first]
-        covariance = parent.covariance(first) + self._covariance_floor
+        covariance = parent.covariance(first) + self.covariance_floor
         relative_poses = {keyframe: se2.between(reference, poses[keyframe]) for keyframe in keyframes}
         return Query(PoseGaussian(reference, covariance), relative_poses)
 
@@ -88,7 +89,7 @@ class AreaEntry:
         """The only child, in a new area of the keyframes ``query``, while the comparison of some of them goes on."""
         child = self.enter_new(parent, query, 0.0)
         reference = next(iter(comparison.query.poses))
-        belief = PoseGaussian(np.zeros(3), child.state.covariances[reference] + self._covariance_floor)
+        belief = PoseGaussian(np.zeros(3), child.state.covariances[reference] + self.covariance_floor)
         comparison = replace(comparison, query=Query(belief, comparison.query.poses), kind="recheck")
         return replace(child, state=replace(child.state, comparison=comparison))
 
@@ -173,7 +174,7 @@ class AreaEntry:
         :param pose: belief over ``area_T_base`` of the scan, in the robot's area.
         """
         belief = self.belief(parent, area)
-        prior = belief.inverse().compose(PoseGaussian(pose.mean, pose.covariance + self._covariance_floor))
+        prior = belief.inverse().compose(PoseGaussian(pose.mean, pose.covariance + self.covariance_floor))
         measured = self._search.measure_pose(parent.hybrid_map, area, parent.area, scan, prior)
         child = parent.unchanged_child(parent.state.after_overlap(None))
         if measured is not None:
@@ -183,7 +184,7 @@ class AreaEntry:
 
     def _keyframe_belief(self, parent: Parent, query: Query, keyframe: int) -> PoseGaussian:
         """The belief over ``reference_T_base`` of a keyframe."""
-        pose, reference = query.poses[keyframe], query.belief.covariance - self._covariance_floor
+        pose, reference = query.poses[keyframe], query.belief.covariance - self.covariance_floor
         return PoseGaussian(pose, relative_covariance(parent.covariance(keyframe), reference, pose, np.zeros((3, 3))))
 
 

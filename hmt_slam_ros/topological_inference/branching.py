@@ -25,6 +25,7 @@ from hmt_slam_ros.hybrid_map.shortest_path import (
 from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions, min_distance
 from hmt_slam_ros.messages.map_changes import Arc
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
+from hmt_slam_ros.messages.statements import StatementEvidence, WeighedStatement
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.relative_motion import is_wide
 from hmt_slam_ros.topological_inference.area_comparison import (
@@ -32,6 +33,7 @@ from hmt_slam_ros.topological_inference.area_comparison import (
     ComparisonKind,
     Fit,
     OngoingComparison,
+    StatedPair,
 )
 from hmt_slam_ros.topological_inference.area_entry import AreaEntry, lose
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
@@ -51,6 +53,13 @@ from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingPriors
 from hmt_slam_ros.topological_inference.map_search import MapSearch
 from hmt_slam_ros.topological_inference.marks import AreaMark, MarkEvidence, MarkMemory
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
+from hmt_slam_ros.topological_inference.statements import (
+    StatementQueue,
+    area_query,
+    due_pair,
+    reweigh_by_statements,
+    weigh_statements,
+)
 
 MIN_PROPOSAL_PROBABILITY = 0.5
 """Smallest probability of a hypothesis for which landmarks propose loops."""
@@ -85,12 +94,14 @@ class BranchingState:
     :ivar search: what the closure search learned.
     :ivar unstored_scans: {keyframe event: scan} of scans that no map holds and that may still be matched.
     :ivar marks: the visits of marks.
+    :ivar statements: what people stated about places and waits for the next event.
     """
 
     largest_area: int = FIRST_AREA
     search: SearchState = field(default_factory=SearchState)
     unstored_scans: Mapping[int, Scan] = field(default_factory=dict)
     marks: MarkMemory = field(default_factory=MarkMemory)
+    statements: StatementQueue = field(default_factory=StatementQueue)
 
 
 class Branching:
@@ -102,6 +113,7 @@ class Branching:
     :ivar landmarks: their evidence on places and loops, where the configuration asks for it.
     :ivar unstored_scans: {keyframe event: scan} of scans that no map holds and that may still be matched.
     :ivar marks: the visits of marks.
+    :ivar statements: what people stated about places and waits for the next event.
     :ivar options: parameters of the inference.
     :ivar kidnapping_priors: of a kidnapping before a keyframe event.
     """
@@ -125,6 +137,8 @@ class Branching:
         self.landmarks = None if landmarks is None else landmarks(configuration, scans)
         self.marks = MarkMemory()
         self._mark_evidence = MarkEvidence(configuration)
+        self.statements = StatementQueue()
+        self._replica, self._statement_evidence = replica, StatementEvidence(configuration.tsbi)
         self.options = configuration.tsbi
         self.kidnapping_priors = KidnappingPriors.from_configuration(configuration)
         self._filter = configuration.filter
@@ -135,7 +149,7 @@ class Branching:
     def state(self) -> BranchingState:
         """What is remembered between two events."""
         search = replace(self.search.state, region_maps=self.map_search.state)
-        return BranchingState(self.entry.largest_area, search, dict(self.unstored_scans), self.marks)
+        return BranchingState(self.entry.largest_area, search, dict(self.unstored_scans), self.marks, self.statements)
 
     def restore(self, state: BranchingState) -> None:
         """Start from a saved state."""
@@ -144,6 +158,7 @@ class Branching:
         self.map_search.restore(state.search.region_maps)
         self.unstored_scans.update(state.unstored_scans)
         self.marks = state.marks
+        self.statements = state.statements
 
     def localize_globally(
         self, parent: Parent, search: GlobalSearch, pose_hint: PoseHint | None = None
@@ -225,6 +240,30 @@ class Branching:
             for visit, before in self.marks.beginning_visits(keyframe)
         )
         return replace(parent, log_weight=parent.log_weight + log_likelihood)
+
+    def take_statements(self, event: int) -> list[str]:
+        """Weigh the statements that wait from now on; returns sentences about those that are dropped."""
+        if not self.statements.waiting:
+            return []
+        hybrid_map, known = self._replica.maps[self._replica.best_hypothesis], self._replica.statements
+        self.statements, self._replica.statements, dropped = self.statements.take(known, hybrid_map, event)
+        return dropped
+
+    def reweigh_by_statements(self, parent: Parent) -> Parent:
+        """The hypothesis with the evidence of what people stated."""
+        statements = self._replica.statements
+        return reweigh_by_statements(parent, statements, self._statement_evidence) if statements else parent
+
+    def weigh_statements(self, statements: Sequence[WeighedStatement]) -> list[str]:
+        """Keep statements with their probabilities under the live hypotheses; returns sentences about them."""
+        maps, probabilities = self._replica.maps, self._replica.probabilities
+        weighed, sentences = weigh_statements(statements, maps, probabilities, self._statement_evidence)
+        self._replica.statements = weighed
+        return sentences
+
+    def due_pair(self, parent: Parent) -> StatedPair | None:
+        """The next two areas that a person states to be one place, and that may be compared; None without."""
+        return None if parent.state.is_lost else due_pair(parent, self._replica.statements)
 
     def leads_elsewhere(self, parent: Parent) -> bool:
         """Whether a mark puts keyframes that were not compared into an area that is not joined to the robot's."""
@@ -324,9 +363,14 @@ class Branching:
 
     def continue_comparison(self, parent: Parent, comparison: OngoingComparison) -> Branches:
         """Branch over no change and further arcs from the robot's area, as soon as the comparison has ended."""
+        pair = comparison.stated_pair
+        if pair is not None and not parent.hybrid_map.has_area(pair.area):
+            return Branches([parent.unchanged_child(replace(parent.state, comparison=None))])
         found = self.search.continue_comparison(parent.hybrid_map, comparison)
         if isinstance(found, OngoingComparison):
             return Branches([self._wait(parent, found)])
+        if pair is not None:
+            return self._join_stated(parent, comparison.query, pair, found)
         is_retry, keyframes = comparison.kind == "retry", list(comparison.query.poses)
         compared = parent.state.matched_keyframes
         state = parent.state.after_matching(
@@ -339,9 +383,28 @@ class Branching:
         # The probability that they are in no place counted when they fitted beside it.
         log_new = 0.0 if is_retry and not fits else math.log(found.new_probability(compared))
         stay = replace(parent.unchanged_child(), log_weight=parent.log_weight + log_new)
-        children = [stay, *(self._join(parent, comparison.query, fit) for fit in fits)]
+        children = [stay, *(self._join(parent, comparison.query, fit, parent.area) for fit in fits)]
         children += self._suspect_arcs(parent, comparison.query, found, compared)
         return Branches(children, True, _log(found.skipped_weight) + parent.log_weight)
+
+    def compare_stated(self, parent: Parent, pair: StatedPair) -> Branches:
+        """Branch over no change and an arc between two areas that a person states to be one place."""
+        query = area_query(parent.hybrid_map, pair.area, self.entry.covariance_floor)
+        excluded = {pair.area, *connected_neighbors(parent.hybrid_map, pair.area)}
+        comparison = self.search.begin_comparison(
+            parent.hybrid_map, pair.area, query, {}, excluded, 1, "stated", (pair.other,)
+        )
+        return self.continue_comparison(parent, replace(comparison, stated_pair=pair))
+
+    def _join_stated(self, parent: Parent, query: Query, pair: StatedPair, found: AreaComparison) -> Branches:
+        """The children after the comparison of two areas that a person states to be one place."""
+        state = replace(parent.state, comparison=None, compared_statement=pair.statement)
+        parent = replace(parent, state=state)
+        # Another event may have joined them meanwhile.
+        is_joined = pair.other in connected_neighbors(parent.hybrid_map, pair.area)
+        stay = replace(parent.unchanged_child(), log_weight=parent.log_weight + math.log(found.new_probability(())))
+        joined = [] if is_joined else [self._join(parent, query, fit, pair.area) for fit in found.fits]
+        return Branches([stay, *joined], True, _log(found.skipped_weight) + parent.log_weight)
 
     @staticmethod
     def _wait(parent: Parent, comparison: OngoingComparison) -> Child:
@@ -416,9 +479,9 @@ class Branching:
         return [lose(child, parent, query)]
 
     @staticmethod
-    def _join(parent: Parent, query: Query, fit: Fit) -> Child:
-        """The robot in its area, which an arc now joins to a known one."""
-        arc = Arc(parent.area, fit.area, query.belief.compose(fit.mode.measured.inverse()), closure=True)
+    def _join(parent: Parent, query: Query, fit: Fit, area: int) -> Child:
+        """The robot in its area, and an arc that now joins a known one with the area of the query."""
+        arc = Arc(area, fit.area, query.belief.compose(fit.mode.measured.inverse()), closure=True)
         log_weight = parent.log_weight + fit.log_weight
         is_found = fit.area in _searched_areas(parent)
         state = replace(parent.state, localization=Tracking()) if is_found else parent.state

@@ -223,11 +223,11 @@ class ClosureSearch:
         :param compared: {known area: keyframes that were compared with it}.
         :param excluded: areas that are neither candidates nor part of a candidate's map.
         :param most: at most this many areas are examined, the most probable.
-        :param only: the only areas to examine in a retry.
+        :param only: the only areas to examine; all if empty.
         :param marks: {area: mark that puts them there}; these areas are examined first.
         """
         within, unexamined, elsewhere = self.gating.classify_areas(hybrid_map, area, query, excluded)
-        if kind == "retry":
+        if only:
             within, unexamined = {known: prior for known, prior in within.items() if known in only}, {}
         self._places_ahead = [PlaceAhead(other, frozenset(excluded)) for other in elsewhere if within]
         marks = {} if marks is None or kind == "retry" else marks

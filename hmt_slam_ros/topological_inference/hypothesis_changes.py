@@ -60,9 +60,14 @@ def apply_revision(parent: Parent, explanation: Hypothesis, newest: int) -> Chil
 
 def _state_after_revision(parent: Parent, explanation: Hypothesis, moved: set[int]) -> HypothesisState:
     """The state without comparisons; in another area, only of the keyframes that moved there."""
-    state = replace(parent.state, matched_keyframes={}, comparison=None, unlinked_overlap=None)
+    state = replace(parent.state, matched_keyframes={}, comparison=None, unlinked_overlap=None, statement_evidence=None)
     if explanation.area == parent.area:
         return state
     covariances = {keyframe: covariance for keyframe, covariance in state.covariances.items() if keyframe in moved}
     unmatched = tuple(keyframe for keyframe in state.unmatched_keyframes if keyframe in moved)
-    return HypothesisState(covariances, unmatched_keyframes=unmatched)
+    return HypothesisState(
+        covariances,
+        unmatched_keyframes=unmatched,
+        statement_evidence=None,
+        compared_statement=state.compared_statement,
+    )

@@ -187,6 +187,9 @@ class HypothesisState:
     :ivar surroundings: what explains the contradictions if the robot was not kidnapped.
     :ivar unstored_poses: {event of these: the robot's pose} of scans that the map does not hold.
     :ivar localization: tracking, or lost.
+    :ivar statement_evidence: log-likelihood of statements that is in the hypothesis's weight, nats; None where TLCA
+        weighed it, as much as it is for the map.
+    :ivar compared_statement: the newest statement whose areas were compared.
     """
 
     covariances: Mapping[int, Covariance] = field(default_factory=dict)
@@ -202,6 +205,8 @@ class HypothesisState:
     surroundings: Surroundings = field(default_factory=Surroundings)
     unstored_poses: Mapping[int, PoseInArea] = field(default_factory=dict)
     localization: Tracking | Lost = field(default_factory=Tracking)
+    statement_evidence: float | None = 0.0
+    compared_statement: int = 0
 
     @property
     def is_lost(self) -> bool:
@@ -354,6 +359,8 @@ class HypothesisState:
             surroundings=self.surroundings,
             unstored_poses=self.unstored_poses,
             localization=self.localization if isinstance(self.localization, Lost) else Tracking(),
+            statement_evidence=self.statement_evidence,
+            compared_statement=self.compared_statement,
         )
 
 

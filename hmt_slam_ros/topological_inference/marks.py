@@ -20,6 +20,7 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate, fuse
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.same_place import areas_of
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.sensors import MarkObservation
@@ -279,7 +280,7 @@ class MarkEvidence:
 
     def _locate(self, hybrid_map: HybridMap, area: int, visits: Sequence[MarkVisit]) -> dict[int, _LocatedKeyframe]:
         """{keyframe of a visit: where it is}, of those that an area admits by ``tsbi.prior_limit``."""
-        areas = _areas_of(hybrid_map, {one.keyframe for one in visits})
+        areas = areas_of(hybrid_map, {one.keyframe for one in visits})
         if not areas:
             return {}
         paths = shortest_path_beliefs(hybrid_map, area, self._cost_limit, targets=set(areas.values()))
@@ -337,12 +338,6 @@ class _VisitPair(NamedTuple):
     area: int
     prior: PoseGaussian
     belief: PoseGaussian
-
-
-def _areas_of(hybrid_map: HybridMap, keyframes: Collection[int]) -> dict[int, int]:
-    """{keyframe: its area} of those that are in a map."""
-    wanted = set(keyframes)
-    return {k: area for area in hybrid_map.area_ids() for k in wanted & hybrid_map.keyframes(area).keys()}
 
 
 def _is_unknown(prior: PoseGaussian) -> bool:

@@ -29,9 +29,11 @@ from hmt_slam_ros.messages.messages import (
     HypothesisEstimate,
     Keyframe,
     Message,
+    Notice,
     TrackingReset,
 )
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS, GlobalPoses, Replica, ReplicaState
+from hmt_slam_ros.messages.statements import PlaceStatement, WeighedStatement
 from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.branching import Branching, BranchingState
@@ -59,6 +61,7 @@ from hmt_slam_ros.topological_inference.relocalization import (
     is_searching,
     update_relocalization,
 )
+from hmt_slam_ros.topological_inference.statements import replace_keyframes
 
 _ONSET_STEP = 10
 """Keyframe events between two changes of the ground that counts as seen before a fault, so that its grid stays cached.
@@ -104,7 +107,8 @@ class TsbiState:
 class Tsbi:
     """Answers the area events of every keyframe with the live hypotheses.
 
-    Consumes TrackingReset, Keyframe, AreaEvents, ClosureDecision; produces Hypotheses, and Notices of proposed loops.
+    Consumes TrackingReset, Keyframe, AreaEvents, ClosureDecision, PlaceStatement; produces Hypotheses, and Notices of
+    proposed loops and of statements.
     """
 
     def __init__(
@@ -131,6 +135,7 @@ class Tsbi:
         self._robot_poses: dict[int, Float64] = {}
         self._reset_event = -1
         self._pose_distribution: PoseDistribution | None = None
+        self._notices: list[Notice] = []
 
     @property
     def state(self) -> TsbiState:
@@ -176,14 +181,17 @@ class Tsbi:
         return elsewhere_probability(localized, probabilities)
 
     def handle(self, message: Message) -> list[Message]:
-        """Learn from ``Keyframe`` and ``ClosureDecision``; answer ``AreaEvents`` with ``Hypotheses``."""
+        """Learn from keyframes, decisions and statements; answer ``AreaEvents`` with ``Hypotheses``."""
         if isinstance(message, Keyframe):
             self._add_keyframe(message)
         elif isinstance(message, AreaEvents):
             answer, landmarks = self._infer(message), self._branching.landmarks
-            return [*(landmarks.notices() if landmarks else ()), answer]
+            notices, self._notices = self._notices, []
+            return [*(landmarks.notices() if landmarks else ()), *notices, answer]
         elif isinstance(message, ClosureDecision):
             self._accept(message)
+        elif isinstance(message, PlaceStatement):
+            self._branching.statements = self._branching.statements.add(message)
         elif isinstance(message, TrackingReset):
             self._reset_event, self._pose_distribution = message.event, None
         return []
@@ -255,6 +263,7 @@ class Tsbi:
                 f"area events {events.sequence} came, but the last keyframe is {last}: a message was lost, start again"
             )
         self._branching.begin_event()
+        self._take_statements(events.sequence)
         by_hypothesis = {event.hypothesis: event for event in events.events}
         keyframe = self._keyframe
         parents = self._parents(keyframe)
@@ -275,22 +284,38 @@ class Tsbi:
         revised = self._state.revised_hypotheses
         is_reset = keyframe.motion_unknown or keyframe.initial_pose is not None
         is_moved = any(hypothesis.moved_keyframes for hypothesis in hypotheses)
-        is_waiting = bool(events.events) and any(child.state.comparison is not None for child in survivors)
+        comparisons = [child.state.comparison for child in survivors if child.state.comparison is not None]
+        is_waiting = any(events.events or comparison.kind == "stated" for comparison in comparisons)
         pruned = () if revised or is_reset or is_moved or is_waiting else events.redundant_keyframes
         stale_beams = () if revised or is_reset else keyframe.stale_beams
-        if pruned:
-            self._move_marks(pruned)
+        moved = self._move_pruned(pruned) if pruned else {}
         answer = Hypotheses(events.sequence, tuple(hypotheses), reduced.unexamined, pruned, stale_beams)
+        statements = replace_keyframes(self._replica.statements, moved)
         self._replica.apply_hypotheses(answer)
+        statements = self._weigh_statements(statements) if statements else ()
         if stale_beams:
             self._branching.forget_scans()
         loaded = [self._with_local_map(h, child) for h, child in zip(hypotheses, survivors, strict=True)]
         still_revised = revised if keyframe.motion_unknown else ()
         self._state = replace(self._state, unexamined=reduced.unexamined, revised_hypotheses=still_revised)
-        return replace(answer, hypotheses=tuple(sorted(loaded, key=lambda hypothesis: hypothesis.id)))
+        ordered = tuple(sorted(loaded, key=lambda hypothesis: hypothesis.id))
+        return replace(answer, hypotheses=ordered, statements=statements)
 
-    def _move_marks(self, pruned: Sequence[PrunedKeyframe]) -> None:
-        """Let visits of marks at keyframes that are pruned from the only map be at the nearest one of the same area."""
+    def _take_statements(self, event: int) -> None:
+        """Weigh the statements that came since the last event; during a revision they wait for the next one."""
+        if not self._state.revised_hypotheses:
+            self._notices += [Notice("tsbi", f"{text}.") for text in self._branching.take_statements(event)]
+
+    def _weigh_statements(self, statements: tuple[WeighedStatement, ...]) -> tuple[WeighedStatement, ...]:
+        """The statements with their probabilities under the surviving hypotheses."""
+        self._notices += [Notice("tsbi", f"{text}.") for text in self._branching.weigh_statements(statements)]
+        return self._replica.statements
+
+    def _move_pruned(self, pruned: Sequence[PrunedKeyframe]) -> dict[int, int]:
+        """Let marks be at the nearest keyframe of the same area instead of one that is pruned.
+
+        :returns: {pruned keyframe: that one}.
+        """
         hybrid_map = self._replica.maps[self._replica.best_hypothesis]
         gone = {one.keyframe for one in pruned}
         anchors = {
@@ -298,6 +323,7 @@ class Tsbi:
             for one in pruned
         }
         self._branching.marks = self._branching.marks.without_keyframes(anchors)
+        return {keyframe: anchor.keyframe for keyframe, anchor in anchors.items() if anchor is not None}
 
     def _parents(self, keyframe: Keyframe) -> list[Parent]:
         """The live hypotheses with their weights; of equivalent ones the heaviest, with the weight of all."""
@@ -312,7 +338,7 @@ class Tsbi:
         ]
         parents = [
             self._branching.reweight_by_marks(parent, self._estimates[parent.hypothesis].pose, keyframe.sequence)
-            for parent in parents
+            for parent in map(self._branching.reweigh_by_statements, parents)
         ]
         localized = [
             LocalizedHypothesis(p.hybrid_map, p.area, pose, {p.area, *p.local_area_poses()})
@@ -421,10 +447,12 @@ class Tsbi:
             return branches if keyframe.mapping else accept_relocalization(branches)
         if state.comparison is not None:
             return self._branching.continue_comparison(parent, state.comparison)
-        if is_recheck_due:
-            return self._branching.recheck(parent)
-        if estimate.stored and state.pending_candidates and unmatched == _RETRY_KEYFRAMES:
-            return self._branching.recheck(parent, state.pending_candidates)
+        pair = self._branching.due_pair(parent) if keyframe.mapping else None
+        if pair is not None:
+            return self._branching.compare_stated(parent, pair)
+        is_retry_due = estimate.stored and bool(state.pending_candidates) and unmatched == _RETRY_KEYFRAMES
+        if is_recheck_due or is_retry_due:
+            return self._branching.recheck(parent, () if is_recheck_due else state.pending_candidates)
         return Branches([parent.unchanged_child()])
 
     def _reduce(self, sequence: int, children: Sequence[Child], branches: Sequence[Branches]) -> ReducedDistribution:
