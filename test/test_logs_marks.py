@@ -87,6 +87,8 @@ def test_a_bag_has_the_same_observations_where_their_topic_is_named(tmp_path, st
         )
         np.testing.assert_allclose(other.measurement.pose.mean, one.measurement.pose.mean, atol=1e-12)
         np.testing.assert_allclose(other.measurement.pose.covariance, one.measurement.pose.covariance, atol=1e-15)
+    assert main(["convert", str(tmp_path / "bag"), str(tmp_path / "copy"), "--marks", "/marks"]) == 0
+    assert len(marks_in(open_log(tmp_path / "copy", marks_topic="/marks"))) == len(wanted)
     part = [
         record.measurement.stamp for record in open_log(tmp_path / "bag", marks_topic="/marks", start=1.0).records()
     ]

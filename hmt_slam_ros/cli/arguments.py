@@ -155,6 +155,7 @@ def _add_time_window(command: argparse.ArgumentParser) -> None:
 def _add_convert_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("source", type=Path, metavar="SRC", help=_LOG)
     command.add_argument("destination", type=Path, metavar="DST", help="rosbag2 folder to make")
+    command.add_argument("--marks", default="", metavar="TOPIC", help="topic of a bag's observations of marks, to keep")
     _add_storage(command)
     _add_time_window(command)
 

@@ -21,7 +21,9 @@ SOMETHING_WRONG = 1
 
 def run_convert(options: argparse.Namespace) -> None:
     """Write any log as a rosbag2."""
-    log = open_log(options.source, start=options.start or 0.0, duration=options.duration or None)
+    log = open_log(
+        options.source, marks_topic=options.marks, start=options.start or 0.0, duration=options.duration or None
+    )
     report_left_out(log, options.command)
     write_bag(log, options.destination, storage=options.storage)
     print(f"{options.destination}: {log.scan_count} scans, {log.duration:.1f} s")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator
-from itertools import islice
 from pathlib import Path
 from zlib import crc32
 
@@ -79,18 +78,14 @@ def write_bag(log: Log, destination: Path, *, storage: str = "mcap") -> None:
 
 
 def _write(log: Log, folder: Path, storage: StoragePlugin) -> None:
-    frames, has_marks = _laser_frames(log)
+    frames, further = _contents(log)
     writer = Writer(folder, version=9, storage_plugin=storage)
     if storage == StoragePlugin.MCAP:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     checksums: list[int] = []
     with writer:
         _collect_checksums(writer.storage, checksums)
-        types = {"/scan": LASER_SCAN, "/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS}
-        if any(record.true_pose is not None for record in islice(log.records(), 1)):
-            types[GROUND_TRUTH_TOPIC] = POSE
-        if has_marks:
-            types[MARKS_TOPIC] = POSE_WITH_COVARIANCE
+        types = {"/scan": LASER_SCAN, "/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS, **further}
         connections = {
             topic: writer.add_connection(topic, kind, typestore=typestore(), offered_qos_profiles=[_qos(topic)])
             for topic, kind in types.items()
@@ -131,16 +126,19 @@ def _qos(topic: str) -> Qos:
     )
 
 
-def _laser_frames(log: Log) -> tuple[dict[bytes, tuple[str, NDArray[np.float64]]], bool]:
-    """{bytes of a laser pose: (name of its frame, pose)}, in the order of first scans; and whether there are marks."""
+def _contents(log: Log) -> tuple[dict[bytes, tuple[str, NDArray[np.float64]]], dict[str, str]]:
+    """{bytes of a laser pose: (name of its frame, pose)}, in the order of first scans; and {further topic: its type}."""
     frames: dict[bytes, tuple[str, NDArray[np.float64]]] = {}
-    has_marks = False
+    further: dict[str, str] = {}
     for record in log.records():
+        if record.true_pose is not None:
+            further[GROUND_TRUTH_TOPIC] = POSE
         if isinstance(record.measurement, Scan):
             pose = record.measurement.laser_pose
             frames.setdefault(pose.tobytes(), (f"{LASER_FRAME}_{len(frames)}" if frames else LASER_FRAME, pose))
-        has_marks = has_marks or isinstance(record.measurement, MarkObservation)
-    return frames, has_marks
+        elif isinstance(record.measurement, MarkObservation):
+            further[MARKS_TOPIC] = POSE_WITH_COVARIANCE
+    return frames, further
 
 
 def _messages(
