@@ -127,7 +127,7 @@ def _qos(topic: str) -> Qos:
 
 
 def _contents(log: Log) -> tuple[dict[bytes, tuple[str, NDArray[np.float64]]], dict[str, str]]:
-    """{bytes of a laser pose: (name of its frame, pose)}, in the order of first scans; and {further topic: its type}."""
+    """{bytes of a laser pose: (name of its frame, pose)}, in the order of first scans; {further topic: its type}."""
     frames: dict[bytes, tuple[str, NDArray[np.float64]]] = {}
     further: dict[str, str] = {}
     for record in log.records():
