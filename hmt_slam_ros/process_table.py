@@ -211,6 +211,8 @@ DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow(f"{_MESSAGES}:EarlyEstimate", "hmt/early_estimate", "early_estimate", 1),
     DocumentRow("hmt_slam_ros.messages.ambiguity:Ambiguity", "hmt/ambiguity", "ambiguity", 1),
     DocumentRow("hmt_slam_ros.messages.topology:Topology", "hmt/topology", "topology", 2),
+    DocumentRow("hmt_slam_ros.messages.alternatives:Alternatives", "hmt/alternatives", "alternatives", 1),
+    DocumentRow("hmt_slam_ros.messages.evidence:Evidence", "hmt/evidence", "evidence", 1),
     DocumentRow(f"{_TEAM}:JoinedGround", "hmt/joined_ground", "joined_ground", 1),
     DocumentRow(f"{_TEAM}:TeamStatus", "/team/statuses", "team_status", 1),
     DocumentRow(f"{_TEAM}:TeamRequest", "/team/requests", "team_request", 1),

@@ -159,8 +159,8 @@ _TASK_TOPICS = ("cmd_vel", "~/task_result", "goal_pose")
 
 _FURTHER_PUBLISHED: dict[str, tuple[str, ...]] = {
     "slam": (*_REQUESTS, "hmt/particles"),
-    "tsbi": ("hmt/pmf", "hmt/is_localized", "hmt/entropy"),
-    "tlca": ("map", "hmt/graph", "hmt/path", "hmt/topology", "hmt/ambiguity_goal"),
+    "tsbi": ("hmt/pmf", "hmt/is_localized", "hmt/entropy", "hmt/evidence"),
+    "tlca": ("map", "hmt/graph", "hmt/path", "hmt/topology", "hmt/alternatives", "hmt/ambiguity_goal"),
     "rtl": ("tf",),
     "team": ("tf",),
     "robot": ("scan", "odom", "/clock", "hmt/robot_status", "tf", "tf_static", "ground_truth", "marks"),
@@ -185,7 +185,7 @@ _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
     "operator": (
         *("map", "pose", "hmt/pose", "hmt/graph", "hmt/particles", "diagnostics", "hmt/incidents", "hmt/notices"),
         *("scan", "tf", "tf_static", "explorer/task_result", "pilot/task_result", "pilot/place_estimate"),
-        *("hmt/ambiguity", "hmt/ambiguity_goal", "hmt/path", "hmt/topology"),
+        *("hmt/ambiguity", "hmt/ambiguity_goal", "hmt/path", "hmt/topology", "hmt/alternatives", "hmt/evidence"),
     ),
 }
 """{node: topics that follow from no message of the process table}."""

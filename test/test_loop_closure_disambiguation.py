@@ -56,8 +56,8 @@ def test_where_the_maps_differ_at_one_place_a_look_there_decides():
     # Behind the robot nothing differs.
     assert all(look.information < 0.02 for look in found.looks if look.pose[0] < 0.0)
     assert found.text.startswith("2 hypotheses are probable (0.50 in area 0, 0.50 in area 1): ")
-    assert " m ahead, in area 0, a look would decide, 0.6" in found.text
-    assert found.text.endswith(" of 0.69 nats")
+    assert " m ahead, in area 0, a look would decide, by 9" in found.text
+    assert found.text.endswith(" % of what is open")
 
 
 def test_one_scan_of_two_may_contradict_the_other_map():

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.messages.alternatives import Alternatives
 from hmt_slam_ros.messages.ambiguity import Ambiguity
 from hmt_slam_ros.messages.documents import (
     FinalCounts,
@@ -26,6 +27,7 @@ from hmt_slam_ros.messages.documents import (
     decode,
     encode,
 )
+from hmt_slam_ros.messages.evidence import Evidence
 from hmt_slam_ros.messages.messages import (
     AreaEvents,
     ClosureDecision,
@@ -64,6 +66,8 @@ KINDS = (
     *get_args(TeamMessage),
     JoinedGround,
     Topology,
+    Alternatives,
+    Evidence,
 )
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 SINGLES = st.floats(allow_nan=False, allow_infinity=False, width=32)

@@ -8,6 +8,7 @@ import pytest
 from three_areas import SECOND, START, STEP, belief, chain
 
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.messages.alternatives import Alternatives, alternative_hypotheses
 from hmt_slam_ros.messages.documents import decode, encode
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.topology import Topology
@@ -65,6 +66,24 @@ def test_it_comes_back_from_its_document(topology):
     assert np.array_equal(read.areas[1].pose.mean, STEP)
     assert read.areas[2].stamps == topology.areas[2].stamps
     assert [arc.probability for arc in read.arcs] == [arc.probability for arc in topology.arcs]
+
+
+def test_the_other_hypotheses_differ_by_arcs_and_by_where_these_put_the_areas():
+    replica = Replica()
+    for message in chain():
+        replica.apply_message(message)
+    assert alternative_hypotheses(replica) == [2]
+    poses = {2: {0: np.zeros(3), 1: STEP, 2: se2.compose(STEP, STEP)}}
+    alternatives = Alternatives.from_replica(replica, poses, {1: np.zeros(3), 2: STEP}, 3)
+    (other,) = decode(encode(alternatives), Alternatives).hypotheses
+    assert (alternatives.best, other.hypothesis, other.area, other.pose.tolist()) == (1, 2, 2, STEP.tolist())
+    assert [(arc.source, arc.target) for arc in other.missing_arcs] == [(0, 2)]
+    assert other.arcs == ()
+    assert [(area.area, area.has_own_keyframes, area.keyframes) for area in other.areas] == [
+        (0, False, ()),
+        (1, False, ()),
+        (2, False, ()),
+    ]
 
 
 def test_as_graphml_it_has_areas_and_arcs_with_their_attributes(topology):

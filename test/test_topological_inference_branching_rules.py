@@ -15,6 +15,7 @@ from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, MovedKeyframe
 from hmt_slam_ros.messages.messages import Hypothesis
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.registration.area_to_area import MatchMode
+from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.topological_inference import area_entry
 from hmt_slam_ros.topological_inference import branching as module
 from hmt_slam_ros.topological_inference.area_comparison import AreaComparison, Fit, OngoingComparison
@@ -146,7 +147,8 @@ def test_an_arc_to_a_known_area_that_none_joined_closes_a_loop(area, closure):
 
 def fit(area, log_weight, pose=(1.0, 0.2, 0.3)):
     pose = np.array(pose)
-    return Fit(area, MatchMode(PoseGaussian(pose, SPREAD), PoseGaussian(pose, 2.0 * SPREAD), 0.0), log_weight)
+    mode = MatchMode(PoseGaussian(pose, SPREAD), PoseGaussian(pose, 2.0 * SPREAD), 0.0)
+    return Fit(area, mode, log_weight, 0.5, Agreement(60, 50, 4))
 
 
 def test_a_cut_branches_over_new_ground_and_every_fit_by_their_weights():

@@ -61,6 +61,20 @@ def test_the_arc_that_closes_the_ring_is_precise(ring):
     assert away @ np.linalg.solve(value.pose.covariance, away) < 16.3
 
 
+def test_what_speaks_for_the_closure_is_said_in_lengths_and_ends_with_its_acceptance():
+    run, _ = around_the_ring()
+    best = run.replica.best_hypothesis
+    a, b, _ = closures(run, best)[0]
+    known = {one.hypothesis: one.steps for one in run.tsbi.evidence.hypotheses}
+    step = next(one for one in known[best] if one.kind == "closure")
+    assert {step.area, step.other} == {a, b}
+    assert 0.0 < step.prior < 1.0
+    assert step.matched > 10.0 * step.contradicting
+    assert all(one.kind in ("new_area", "unchanged") for h in known.keys() - {best} for one in known[h][-1:])
+    run.accept(best)
+    assert run.tsbi.evidence.hypotheses == ()
+
+
 def test_two_runs_are_the_same_to_the_bit(ring):
     run, _ = ring
     again, _ = around_the_ring()

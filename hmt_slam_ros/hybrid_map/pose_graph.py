@@ -395,6 +395,12 @@ def consistent_map(hybrid_map: HybridMap) -> GlobalMap:
     return GlobalMap(poses, chi2)
 
 
+def consistent_poses(hybrid_map: HybridMap) -> dict[int, Float64]:
+    """{area: ``map_T_area``, shape (3,)} of :func:`consistent_map`, without covariances."""
+    areas, _, solution = _solve_areas(hybrid_map, marginals=False)
+    return dict(zip(areas, solution.poses, strict=True))
+
+
 def total_arc_chi2(hybrid_map: HybridMap) -> float:
     """The chi-square of all arcs against the poses that agree best with them; 3 degrees of freedom a cycle."""
     return _solve_areas(hybrid_map, marginals=False)[2].chi2

@@ -300,7 +300,7 @@ def _describe(
     verb = "decide" if look.information >= 0.5 * ambiguity.entropy else "help"
     return (
         f"{begin}: {look.path_length:.1f} m {_direction(places[best])}, in area {look.area}, a look would {verb}, "
-        f"{look.information:.2f} of {ambiguity.entropy:.2f} nats"
+        f"by {look.information / ambiguity.entropy:.0%} of what is open".replace("%", " %")
     )
 
 

@@ -22,6 +22,7 @@ from hmt_slam_ros.geometry.gaussian import ELLIPSE_95, PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.hybrid_map.surroundings import stack_poses
+from hmt_slam_ros.messages.alternatives import Alternatives, alternative_hypotheses
 from hmt_slam_ros.messages.map_changes import AreaPose
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
@@ -146,6 +147,17 @@ class MapRenderer:
         """
         pose = robot_poses[self._replica.best_hypothesis]
         return Topology.from_replica(self._replica, self._area_poses, pose, self._frame, self.events, self.stamp)
+
+    def alternatives(self, robot_poses: Mapping[int, Float64]) -> Alternatives:
+        """The maps of the other hypotheses as data.
+
+        :param robot_poses: of :meth:`topology`.
+        """
+        from hmt_slam_ros.hybrid_map.pose_graph import consistent_poses  # noqa: PLC0415  only for subscribers
+
+        maps = self._replica.maps
+        poses = {h: consistent_poses(maps[h]) for h in alternative_hypotheses(self._replica) if h in robot_poses}
+        return Alternatives.from_replica(self._replica, poses, robot_poses, self.events)
 
     def graph_markers(self) -> MarkerArray:
         """Areas as labeled discs, arcs as lines, both with 95 % ellipses and texts.

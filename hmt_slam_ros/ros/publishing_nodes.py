@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,8 +15,10 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.messages.alternatives import Alternatives
 from hmt_slam_ros.messages.ambiguity import Ambiguity
 from hmt_slam_ros.messages.documents import encode
+from hmt_slam_ros.messages.evidence import Evidence
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Message, RealTimePose, TrackingReset
 from hmt_slam_ros.messages.statements import parse_statement
 from hmt_slam_ros.messages.topology import Topology
@@ -77,15 +80,21 @@ class TsbiNode(ProcessNode):
         self._localized_publisher = self.create_publisher(Bool, IS_LOCALIZED, topics.LATCHED)
         self._entropy_publisher = self.create_publisher(Float64, ENTROPY, topics.LATCHED)
         self.create_subscription(String, STATEMENT, self._on_statement, topics.STREAM)
+        self._evidence_publisher = self.create_publisher(String, DOCUMENTS[Evidence], topics.LATCHED)
+        self._published_evidence: Evidence | None = None
         self._publish_localization()
 
     def publish_views(self, message: Message, outputs: list[Message]) -> None:
-        """Publish the distribution over the topological paths, Eq. (14), and whether the robot is localized."""
+        """Publish the distribution over the topological paths, Eq. (14), its evidence, and whether it is localized."""
         if outputs or isinstance(message, ClosureDecision | TrackingReset):
             self._publish_localization()
         for output in outputs:
             if isinstance(output, Hypotheses):
                 self._pmf.publish(pmf_message(output))
+        if self.process.evidence is not self._published_evidence:
+            self._published_evidence = self.process.evidence
+            document = encode(self._published_evidence, self.reset_number, self.diagnostics.system.name)
+            self._evidence_publisher.publish(String(data=document))
 
     def _on_statement(self, message: String) -> None:
         """Deliver what a person states about two areas."""
@@ -106,7 +115,7 @@ class TsbiNode(ProcessNode):
         self._localized_publisher.publish(Bool(data=status.localized))
         self._entropy_publisher.publish(Float64(data=status.entropy))
         self.diagnostics.values["localized"] = "yes" if status.localized else "no, the robot may be anywhere in the map"
-        self.diagnostics.values["entropy of the area"] = f"{status.entropy:.3f} nats"
+        self.diagnostics.values["area as open as"] = f"{math.exp(status.entropy):.2f} places"
 
 
 def pmf_message(hypotheses: Hypotheses) -> Float64MultiArray:
@@ -135,6 +144,7 @@ class TlcaNode(ProcessNode):
             MapPublisher(self, MarkerArray, GRAPH, MapRenderer.graph_markers, _DRAWING_PERIOD),
             MapPublisher(self, PathMessage, PATH, MapRenderer.path, _DATA_PERIOD),
             MapPublisher(self, String, DOCUMENTS[Topology], self._topology_document, _DATA_PERIOD),
+            MapPublisher(self, String, DOCUMENTS[Alternatives], self._alternatives_document, _DATA_PERIOD),
         )
         self._ambiguity_goals = self.create_publisher(PoseStamped, AMBIGUITY_GOAL, topics.STREAM)
         self.create_timer(_CHECK_PERIOD, self._publish_if_changed, clock=self.diagnostics.steady_clock)
@@ -191,6 +201,10 @@ class TlcaNode(ProcessNode):
     def _topology_document(self, renderer: MapRenderer) -> String:
         topology = renderer.topology(self.process.robot_poses)
         return String(data=encode(topology, self.reset_number, self.diagnostics.system.name))
+
+    def _alternatives_document(self, renderer: MapRenderer) -> String:
+        alternatives = renderer.alternatives(self.process.robot_poses)
+        return String(data=encode(alternatives, self.reset_number, self.diagnostics.system.name))
 
     def _get_graphml(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Answer with the areas and arcs as GraphML."""

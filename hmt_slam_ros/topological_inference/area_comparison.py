@@ -35,11 +35,15 @@ class Fit(NamedTuple):
     :ivar mode: of their match with it.
     :ivar log_weight: log pi p(z), p(z) relative to new ground, nats. The appearance of the place adds nothing to the
         evidence of its surfaces (docs/decisions/0019-appearance-for-retrieval.md).
+    :ivar prior: pi, the probability of the place before its surfaces were compared.
+    :ivar agreement: of the surfaces of the keyframes with the area's map.
     """
 
     area: int
     mode: MatchMode
     log_weight: float
+    prior: float
+    agreement: Agreement
 
 
 class AreaComparison(NamedTuple):

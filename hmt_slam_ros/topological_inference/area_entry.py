@@ -127,7 +127,7 @@ class AreaEntry:
     def enter_known(self, parent: Parent, query: Query, fit: Fit) -> Child:
         """A known area, recognized."""
         arc = query.belief.compose(fit.mode.measured.inverse())
-        return self.enter_area(parent, query, fit.area, fit.mode.pose, arc, fit.log_weight)
+        return replace(self.enter_area(parent, query, fit.area, fit.mode.pose, arc, fit.log_weight), fit=fit)
 
     def enter_area(
         self, parent: Parent, query: Query, area: int, entry: PoseGaussian, arc: PoseGaussian | None, log_factor: float

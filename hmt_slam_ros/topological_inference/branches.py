@@ -13,6 +13,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.messages.map_changes import Arc, ArcEnds, AreaMerge, MovedKeyframe
 from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
+from hmt_slam_ros.topological_inference.area_comparison import Fit
 from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
@@ -54,6 +55,7 @@ class Child:
     :ivar parent: id of the hypothesis that it continues.
     :ivar log_weight: log of its weight, unnormalized.
     :ivar reload_local_map: whether the submap has to be loaded again.
+    :ivar fit: by which keyframes lie in a known area, if they were compared with it.
     """
 
     parent: int
@@ -66,6 +68,7 @@ class Child:
     reload_local_map: bool = False
     removed_arcs: tuple[ArcEnds, ...] = ()
     area_merge: AreaMerge | None = None
+    fit: Fit | None = None
 
 
 class Branches(NamedTuple):

@@ -485,7 +485,8 @@ class Branching:
         log_weight = parent.log_weight + fit.log_weight
         is_found = fit.area in _searched_areas(parent)
         state = replace(parent.state, localization=Tracking()) if is_found else parent.state
-        return replace(parent.unchanged_child(state), log_weight=log_weight, arcs=(arc,), reload_local_map=True)
+        child = replace(parent.unchanged_child(state), log_weight=log_weight, arcs=(arc,), reload_local_map=True)
+        return replace(child, fit=fit)
 
 
 def _belongs_to_cut(comparison: OngoingComparison, keyframes: Sequence[int]) -> bool:

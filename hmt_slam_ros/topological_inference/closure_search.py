@@ -396,11 +396,12 @@ class ClosureSearch:
             distance = float(difference @ np.linalg.solve(prior.covariance, difference))
             log_offset = -0.5 * max(0.0, distance - entry.median_mahalanobis2)
             if mark is None:
-                yield Fit(area, mode, math.log(pi) + mode.log_mass - log_total_mass + log_evidence + log_offset)
+                log_weight = math.log(pi) + mode.log_mass - log_total_mass + log_evidence + log_offset
+                yield Fit(area, mode, log_weight, pi, agreement)
                 continue
             weight = by_arcs * math.exp(mode.log_mass - log_total_mass + log_offset) + (pi - by_arcs) * share
             if weight > 0.0:
-                yield Fit(area, fuse_with_mark(mode, mark.belief), math.log(weight) + log_evidence)
+                yield Fit(area, fuse_with_mark(mode, mark.belief), math.log(weight) + log_evidence, pi, agreement)
 
 
 def known_ground_log_ratio(agreement: Agreement, clutter: float) -> float:

@@ -19,6 +19,7 @@ from hmt_slam_ros.hybrid_map.hypothesis_agreement import (
     merge_equivalent,
 )
 from hmt_slam_ros.hybrid_map.surroundings import areas_around, consistent_pose
+from hmt_slam_ros.messages.evidence import Evidence
 from hmt_slam_ros.messages.map_changes import AreaPose, LocalArea, PrunedKeyframe
 from hmt_slam_ros.messages.messages import (
     AreaEvent,
@@ -38,6 +39,7 @@ from hmt_slam_ros.random_streams import Purpose, random_stream
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.branching import Branching, BranchingState
 from hmt_slam_ros.topological_inference.closure_search import known_ground_log_ratio
+from hmt_slam_ros.topological_inference.evidence_record import EvidenceRecord
 from hmt_slam_ros.topological_inference.hypothesis_changes import apply_revision, merge_areas
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     HypothesisState,
@@ -136,6 +138,12 @@ class Tsbi:
         self._reset_event = -1
         self._pose_distribution: PoseDistribution | None = None
         self._notices: list[Notice] = []
+        self._evidence = EvidenceRecord()
+
+    @property
+    def evidence(self) -> Evidence:
+        """Why there are several hypotheses; the same object until that changes."""
+        return self._evidence.evidence
 
     @property
     def state(self) -> TsbiState:
@@ -280,6 +288,7 @@ class Tsbi:
         reduced = self._reduce(events.sequence, children, branches)
         survivors = [children[k] for k in reduced.indices]
         hypotheses = self._surviving_hypotheses(children, survivors, reduced.probabilities)
+        self._evidence.after_event(events.sequence, self._replica.maps, hypotheses, survivors)
         # Keyframes and beams that a revision, a reset or a kidnapping moves must still be there.
         revised = self._state.revised_hypotheses
         is_reset = keyframe.motion_unknown or keyframe.initial_pose is not None
@@ -530,6 +539,7 @@ class Tsbi:
             self._state = replace(self._state, global_poses=decision.global_poses)
         if decision.hypothesis is None:
             return
+        self._evidence.clear(decision.sequence)
         self._replica.apply_decision(decision)
         self._branching.marks = self._branching.marks.restricted_to(self._replica.scans)
         self._state = replace(
