@@ -174,8 +174,10 @@ _FURTHER_PUBLISHED: dict[str, tuple[str, ...]] = {
 _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
     "slam": (*_RESPONSES, "tf_static", "diagnostics"),
     "view": (
-        *("pose", "hmt/pose", "hmt/graph", "map", "hmt/keyframes", "hmt/hypotheses", "hmt/is_localized"),
-        *("hmt/entropy", "hmt/robot_status", "diagnostics", "/team/placements"),
+        *("pose", "hmt/pose", "hmt/topology", "hmt/alternatives", "hmt/evidence", "map", "hmt/keyframes"),
+        *("hmt/keyframe_scans", "hmt/hypotheses", "hmt/closure_decisions", "hmt/is_localized", "hmt/entropy"),
+        *("scan", "hmt/particles", "goal_pose", "hmt/ambiguity_goal", "pilot/place_estimate", "hmt/robot_status"),
+        *("diagnostics", "/team/placements"),
     ),
     "robot": ("hmt/local_estimate", "hmt/tracking_reset", "diagnostics"),
     "team": ("hmt/reset_request", "rendezvous"),

@@ -8,6 +8,7 @@ import select
 import shutil
 import subprocess
 import time
+from pathlib import Path
 
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
@@ -25,6 +26,13 @@ FLAGS = (
 )
 PATIENCE = 30.0  # s
 FROM_BROWSER, TO_BROWSER = 4, 3  # file descriptors of the browser, as --remote-debugging-pipe has them
+
+
+def screenshot_folder(otherwise):
+    """Where pictures of the page are kept: HMT_SLAM_SCREENSHOTS, or another folder."""
+    folder = Path(os.environ.get("HMT_SLAM_SCREENSHOTS", otherwise))
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 def find_browser():

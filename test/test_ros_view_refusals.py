@@ -6,19 +6,25 @@ import socket
 from array import array
 from urllib.request import urlopen
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, PoseWithCovarianceStamped, Quaternion
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
+from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Float64, String
-from visualization_msgs.msg import Marker, MarkerArray
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.messages.documents import ScanGeometry, encode
+from hmt_slam_ros.messages.topology import Topology, TopologyArea, TopologyHypothesis
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.view_conversions import area_section, finite, graph_section, map_cells, map_section, robot_section
+from hmt_slam_ros.ros.map_layers import beams_of
+from hmt_slam_ros.ros.view_conversions import area_section, finite, map_cells, map_section, robot_section
+from hmt_slam_ros.view.topology_section import topology_section
 
 NAN, INFINITY = math.nan, math.inf
 
@@ -38,12 +44,16 @@ def grid(width=3, height=2, count=6, resolution=0.05, x=0.0, w=1.0):
     return message
 
 
-def graph(x=1.0, angle=0.0, scale=1.0, points=2, end=2.0):
-    disc, line = Marker(ns="areas", id=1), Marker(ns="arcs", id=2, points=[Point(x=end)] * points)
-    ellipse = Marker(ns="arc_uncertainty", id=2, text="t" * 10_000)
-    disc.pose.position.x, ellipse.scale.x = x, scale
-    ellipse.pose.orientation = Quaternion(z=math.sin(0.5 * angle), w=math.cos(0.5 * angle))
-    return MarkerArray(markers=[disc, line, ellipse])
+def topology(stamp=5, keyframes=1):
+    """The document of a map of one area."""
+    known = PoseGaussian(np.array([1.0, 2.0, 0.5]), 0.01 * np.eye(3))
+    poses, numbers = (np.zeros(3),) * keyframes, tuple(range(keyframes))
+    area = TopologyArea(0, known, numbers, (5,) * keyframes, poses)
+    return Topology(1, stamp, "map", (TopologyHypothesis(0, 1.0, 0),), 0.0, 0, np.zeros(3), (area,), ())
+
+
+def laser(angle=0.1, range_max=30.0, beams=3):
+    return LaserScan(angle_min=-0.1, angle_increment=angle, range_max=range_max, ranges=[1.0] * beams)
 
 
 @pytest.fixture(autouse=True)
@@ -60,7 +70,11 @@ BAD_GRIDS = [
     grid(0, 0, 0), grid(0, 5, 0), grid(3, 2, 5), grid(2**32 - 1, 2**32 - 1, 6), grid(resolution=NAN),
     grid(resolution=INFINITY), grid(resolution=0.0), grid(resolution=-0.05), grid(x=NAN), grid(w=NAN), grid(w=0.0),
 ]  # fmt: skip
-BAD_GRAPHS = [graph(NAN), graph(1e308), graph(angle=NAN), graph(scale=INFINITY), graph(points=17), graph(end=NAN)]
+BAD_GRAPHS = [
+    *("hello", encode(topology(stamp=10**400)), encode(topology()).replace("2.0,0.5", "2e9,0.5")),
+    *(encode(topology()).replace('"probability":1.0', word) for word in ('"probability":NaN', '"probability":1e999')),
+]
+BAD_SCANS = [laser(NAN), laser(1e9), laser(range_max=NAN), laser(beams=20_001)]
 
 
 @pytest.mark.parametrize("message", BAD_POSES)
@@ -75,15 +89,15 @@ def test_a_map_that_is_none_is_refused(message):
         map_section(message) and map_cells(message)
 
 
-@pytest.mark.parametrize("message", BAD_GRAPHS)
-def test_a_graph_that_is_none_is_refused(message):
-    with pytest.raises(HmtSlamError, match=": "):
-        graph_section(message)
+@pytest.mark.parametrize("message", BAD_SCANS)
+def test_a_scan_that_is_none_is_refused(message):
+    with pytest.raises(HmtSlamError, match=r"look who publishes it|is NaN"):
+        beams_of(message)
 
 
-def test_too_many_markers_and_long_frames_are_refused():
-    with pytest.raises(HmtSlamError, match="a graph has 20001 markers, more than 20000"):
-        graph_section(MarkerArray(markers=[Marker()] * 20_001))
+def test_too_many_keyframes_and_long_frames_are_refused():
+    with pytest.raises(HmtSlamError, match="a map of 0 arcs and 50001 keyframes is too large to be shown"):
+        topology_section(topology(keyframes=50_001))
     for frame in ("area_" + "9" * 5000, "area_\N{ARABIC-INDIC DIGIT FOUR}", "map", ""):
         with pytest.raises(HmtSlamError, match="run the same version everywhere"):
             area_section(pose(frame=frame))
@@ -97,8 +111,8 @@ def test_a_map_beyond_what_is_shown_is_refused():
 def test_what_is_well_passes():
     assert robot_section(pose())["pose"] == [1.0, 0.0, 0.0]
     assert area_section(pose(frame="area_12")) == "12"
-    assert graph_section(graph())["arcs"][0]["ends"] == [[2.0, 0.0]] * 2
-    assert len(graph_section(graph())["arcs"][0]["text"]) == 500
+    assert topology_section(topology())["areas"][0]["pose"] == [1.0, 2.0, 0.5]
+    assert beams_of(laser()).points(ScanGeometry(0, 0.0, 0.1, 0.0, 30.0, np.zeros(3), 0.0, np.zeros(3))).shape == (3, 2)
     assert map_section(grid()) == {"origin": [0.0, 0.0], "size": [0.15, 0.1]}
     assert map_cells(grid()).shape == (2, 3)
     assert finite(0.5, "entropy") == 0.5
@@ -122,13 +136,13 @@ def test_the_node_survives_what_a_stranger_says_counts_it_and_shows_what_is_well
     poses = node.create_publisher(PoseWithCovarianceStamped, topics.POSE, topics.STREAM)
     areas = node.create_publisher(PoseWithCovarianceStamped, topics.HMT_POSE, topics.STREAM)
     maps = node.create_publisher(OccupancyGrid, topics.MAP, topics.LATCHED)
-    graphs = node.create_publisher(MarkerArray, topics.GRAPH, topics.LATCHED)
+    graphs = node.create_publisher(String, topics.DOCUMENTS[Topology], topics.LATCHED)
     entropies = node.create_publisher(Float64, topics.ENTROPY, topics.LATCHED)
     statuses = node.create_publisher(String, topics.ROBOT_STATUS, topics.LATCHED)
     health = node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, topics.STREAM)
     # Latched: the node receives these when it starts.
     maps.publish(grid(0, 0, 0))
-    graphs.publish(graph(angle=NAN))
+    graphs.publish(String(data="hello"))
     entropies.publish(Float64(data=NAN))
     statuses.publish(String(data="hello"))
     port = free_port()
@@ -139,16 +153,17 @@ def test_the_node_survives_what_a_stranger_says_counts_it_and_shows_what_is_well
         newest = next((s for a in reversed(reports) for s in a.status if s.name == "/view"), None)
         return {} if newest is None else {v.key: int(v.value) for v in newest.values if v.key.startswith("refused on")}
 
-    latched = {f"refused on {topic}" for topic in (topics.GRAPH, topics.ENTROPY, topics.ROBOT_STATUS)}
+    latched = {f"refused on {topic}" for topic in (topics.DOCUMENTS[Topology], topics.ENTROPY, topics.ROBOT_STATUS)}
     listener.until(lambda: latched <= counts().keys(), alive=[view])
     with urlopen(f"http://127.0.0.1:{port}/news", timeout=20):  # a browser is there, so it subscribes to the map
         listener.until(lambda: f"refused on {topics.MAP}" in counts(), alive=[view])
         for message in BAD_GRIDS:
             maps.publish(message)
             listener.spin(0.25)
-        for message in BAD_GRAPHS:
-            graphs.publish(message)
-            listener.spin(0.25)
+        for message in BAD_GRAPHS[:2]:
+            before = counts()[f"refused on {topics.DOCUMENTS[Topology]}"]
+            graphs.publish(String(data=message))
+            listener.until(lambda: counts()[f"refused on {topics.DOCUMENTS[Topology]}"] > before, alive=[view])  # noqa: B023
         for message in BAD_POSES:
             poses.publish(message)
             listener.spin(0.25)
@@ -163,7 +178,7 @@ def test_the_node_survives_what_a_stranger_says_counts_it_and_shows_what_is_well
         assert not snapshot(port).keys() & {"robot", "map", "graph", "entropy", "replay"}
         poses.publish(pose(4.0))
         maps.publish(grid())
-        graphs.publish(graph())
+        graphs.publish(String(data=encode(topology())))
         entropies.publish(Float64(data=0.25))
         listener.until(lambda: {"robot", "map", "graph", "entropy"} <= snapshot(port).keys(), alive=[view])
     assert snapshot(port)["robot"]["pose"] == [4.0, 0.0, 0.0]

@@ -4,7 +4,6 @@ The screenshots stay in the folder HMT_SLAM_SCREENSHOTS, or in pytest's own.
 """
 
 import json
-import os
 import socket
 from collections import Counter
 from pathlib import Path
@@ -12,7 +11,7 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
-from browser import Browser, Page, find_browser
+from browser import Browser, Page, find_browser, screenshot_folder
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -65,9 +64,7 @@ def browser(tmp_path):
 
 @pytest.fixture
 def screenshots(tmp_path):
-    folder = Path(os.environ.get("HMT_SLAM_SCREENSHOTS", tmp_path))
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+    return screenshot_folder(tmp_path)
 
 
 def free_port():

@@ -5,16 +5,24 @@ import time
 
 import numpy as np
 import pytest
-from browser import Browser, find_browser
+from browser import Browser, find_browser, screenshot_folder
+from map_for_page import BEST, OTHER, alternatives, evidence, history, topology
 
 from hmt_slam_ros.messages.team import TeamPlacement, Verdict
+from hmt_slam_ros.results.plots import color_of
 from hmt_slam_ros.view.board import Board
+from hmt_slam_ros.view.map_sections import MapSections
 from hmt_slam_ros.view.server import PageServer, grid_png
 from hmt_slam_ros.view.team_section import TeamSection
 
 pytestmark = pytest.mark.skipif(
     find_browser() is None, reason="the page is looked at in a browser: apt install chromium"
 )
+
+
+def points(keyframe):
+    """Surfaces beside a keyframe."""
+    return np.array([[1.0, 0.1 * k] for k in range(20)])
 
 
 class Shown:
@@ -68,7 +76,7 @@ def test_the_maps_of_joined_robots_are_drawn_and_all_are_listed(page, tmp_path):
     page.board.put("team", section.content())
     page.until(lambda: page.drawing.get("team") == [{"name": "bob", "map": True, "robot": True}])
     page.browser.screenshot(tmp_path / "team.png")
-    assert [row.strip() for row in page.text("robots").split("\n") if row.strip()] == [
+    assert lines_of(page, "robots") == [
         "bob",
         "joined, 99.9 %",
         "cid",
@@ -100,3 +108,82 @@ def test_what_happened_is_listed_with_times(page):
     page.until(lambda: page.text("newest").endswith(", slam"))
     page.browser.evaluate("document.getElementById('incidents').closest('details').open = true")
     page.until(lambda: "slam: was started again" in page.text("incidents"))
+
+
+@pytest.fixture
+def screenshots(tmp_path):
+    return screenshot_folder(tmp_path)
+
+
+@pytest.fixture
+def mapped(page):
+    """The page with a map of two hypotheses; the walls and the past of its keyframes are there."""
+    board, sections = page.board, MapSections(page.board)
+    for keyframe in range(24):
+        board.walls.add(keyframe, points(keyframe))
+    board.clear_history()
+    for event in history(24):
+        board.append_event(event)
+    for events in (8, 16, 24):
+        sections.add_topology(topology(count=events // 4, events=events))
+    sections.add_evidence(evidence())
+    sections.add_alternatives(alternatives())
+    board.put("robot", {"pose": [10.0, 0.0, 1.5], "ellipse": [0.2, 0.1, 0.0], "deviation": 0.1, "turn": 1.0})
+    page.until(lambda: page.drawing.get("areas") == 6 and page.drawing["bars"] == 2)
+    yield page
+    if page.drawing["selected"] is not None:
+        press(page, OTHER)
+        page.until(lambda: page.drawing["selected"] is None)
+
+
+def lines_of(page, name):
+    return [line.strip() for line in page.text(name).split("\n") if line.strip()]
+
+
+def press(page, hypothesis):
+    page.browser.evaluate(f"document.querySelector('[data-hypothesis=\"{hypothesis}\"]').click()")
+
+
+def test_a_selected_hypothesis_shows_its_map_its_pose_and_what_speaks_for_and_against_it(mapped, screenshots):
+    best = mapped.drawing
+    assert best["candidates"] == [[0, 5]]
+    assert (best["closures"], best["others"], best["walls"], best["path"]) == (1, 1, 0, 24)
+    assert lines_of(mapped, "reasons") == [
+        "Area 5 #7 now 90.0 %",
+        "closes 5 with 0, 60.0 % then",
+        "12.4 m of walls match",
+        "0.8 m of walls are seen through",
+        "odometry and arcs alone: 3.0 %",
+    ]
+    mapped.browser.screenshot(screenshots / "best_hypothesis.png")
+    press(mapped, OTHER)
+    mapped.until(lambda: mapped.drawing["selected"] == OTHER and mapped.drawing["walls"] == 24)
+    other = mapped.drawing
+    assert (other["closures"], other["arcs"], other["areas"], other["path"]) == (0, 5, 6, 24)
+    assert other["robot"] != best["robot"]
+    shift = np.subtract(other["spots"][5]["at"], best["spots"][5]["at"])
+    assert np.hypot(*shift) > 20
+    assert mapped.text("banner") == "Map under hypothesis Area 5 #12"
+    assert lines_of(mapped, "reasons") == [
+        "Area 5 #12 now 10.0 %",
+        "is on new ground, area 5, 40.0 % then",
+        "has no arc between 0 and 5, as the most probable one has",
+    ]
+    mapped.browser.screenshot(screenshots / "other_hypothesis.png")
+    mapped.board.append_event({**history(25)[-1], "hypotheses": [[BEST, 5, 1.0, False]], "live": 1})
+    mapped.until(lambda: mapped.drawing["selected"] is None)
+    assert "Hypothesis #12 has ended" in mapped.text("hint")
+
+
+def test_the_colors_of_a_hypothesis_are_those_of_the_plots(page):
+    for number in (0, 1, 7, 12, 345):
+        expected = [round(255.0 * channel) for channel in color_of(number)]
+        found = page.browser.evaluate(
+            f"""import('./draw.js').then(({{ colour }}) => {{
+                const context = new OffscreenCanvas(1, 1).getContext('2d');
+                context.fillStyle = colour({number});
+                context.fillRect(0, 0, 1, 1);
+                return [...context.getImageData(0, 0, 1, 1).data].slice(0, 3);
+            }})"""
+        )
+        assert np.abs(np.subtract(found, expected)).max() <= 3, number

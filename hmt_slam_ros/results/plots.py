@@ -111,7 +111,7 @@ def draw_team(path: Path, surfaces: Mapping[str, NDArray[np.float64]]) -> Path:
     figure = Figure(figsize=_figure_size(float(size[0]), float(size[1])), layout="constrained")
     axes = figure.subplots()
     for number, (name, points) in enumerate(surfaces.items()):
-        color = _color_of(number)
+        color = color_of(number)
         axes.plot(points[:, 0], points[:, 1], ",", color=color, alpha=0.6, rasterized=True)
         axes.plot([], [], "s", color=color, label=name)
     axes.set_aspect("equal")
@@ -128,7 +128,7 @@ def _draw_piece(axes: Axes, hybrid_map: HybridMap, piece: MapPiece) -> None:
     axes.set_ylim(bottom, top)
     axes.plot(piece.path[:, 0], piece.path[:, 1], color=_PATH, linewidth=0.8, label="path", zorder=2)
     for area, positions in piece.keyframes.items():
-        axes.plot(positions[:, 0], positions[:, 1], ".", color=_color_of(area), markersize=4, zorder=3)
+        axes.plot(positions[:, 0], positions[:, 1], ".", color=color_of(area), markersize=4, zorder=3)
     _draw_arcs(axes, hybrid_map, piece.area_poses)
     _draw_areas(axes, piece.area_poses, 0.01 * float(np.diff(piece.corners, axis=0).max()))
 
@@ -203,7 +203,7 @@ def _draw_areas(axes: Axes, area_poses: Mapping[int, PoseGaussian], visible: flo
     largest = max(ellipse.semi_major for ellipse in ellipses.values())
     factor = 1 if largest <= 0.0 else int(10 ** np.clip(np.ceil(np.log10(visible / largest)), 0, 2))
     is_exceeding = [
-        _draw_ellipse(axes, area_poses[area].mean, ellipse, factor, _color_of(area))
+        _draw_ellipse(axes, area_poses[area].mean, ellipse, factor, color_of(area))
         for area, ellipse in ellipses.items()
     ]
     for area, belief in area_poses.items():
@@ -215,7 +215,7 @@ def _draw_areas(axes: Axes, area_poses: Mapping[int, PoseGaussian], visible: flo
             fontsize=7,
             fontweight="bold",
             zorder=6,
-            bbox={"boxstyle": "circle,pad=0.25", "facecolor": "white", "edgecolor": _color_of(area), "linewidth": 1.5},
+            bbox={"boxstyle": "circle,pad=0.25", "facecolor": "white", "edgecolor": color_of(area), "linewidth": 1.5},
         )
     enlarged = f", enlarged {factor} times" if factor > 1 else ""
     hatched = ", hatched where it exceeds the map" if any(is_exceeding) else ""
@@ -296,7 +296,7 @@ def _draw_bars(
     edges = _bar_edges(minutes[firsts])
     left, right = edges[:-1].repeat(counts), edges[1:].repeat(counts)
     corners = np.stack([(left, bottoms), (right, bottoms), (right, tops), (left, tops)]).transpose(2, 0, 1)
-    colors = [_color_of(int(hypothesis)) for hypothesis in table["hypothesis"]]
+    colors = [color_of(int(hypothesis)) for hypothesis in table["hypothesis"]]
     axes.add_collection(PolyCollection(list(corners), facecolors=colors, edgecolors="none"))
     axes.plot([], [], "s", color="none", markeredgecolor="gray", label="white: not examined or dropped")
     axes.set_xlim(edges[0], edges[-1])
@@ -342,8 +342,11 @@ def read_table(path: Path) -> dict[str, NDArray[np.float64]]:
     return {name: columns[:, k] for k, name in enumerate(names)}
 
 
-def _color_of(number: int) -> Color:
-    """The color of an area or hypothesis: hues by the golden section, in two shades."""
+def color_of(number: int) -> Color:
+    """The color of an area or hypothesis, RGB in [0, 1], as on the live page.
+
+    Hues by the golden section, in two shades.
+    """
     return colorsys.hsv_to_rgb((0.58 + number * _GOLDEN) % 1.0, 0.85, 0.85 if number % 2 else 0.65)
 
 

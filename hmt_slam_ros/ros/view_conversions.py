@@ -11,7 +11,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
-from visualization_msgs.msg import Marker, MarkerArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import ELLIPSE_95
@@ -30,12 +29,6 @@ from hmt_slam_ros.view.incidents import Incident
 
 _MAX_CELLS = 64_000_000
 """Of a map: 400 m by 400 m in cells of 5 cm; its picture takes about a second."""
-_MAX_MARKERS = 20_000
-"""Of a graph; five for an area and its arc."""
-_MAX_LINE_POINTS = 16
-"""Of an arc, which has two."""
-_MAX_TEXT = 500
-"""Characters of a marker that the page shows."""
 _MAX_FRAME = 40
 """Characters of an area's frame."""
 _MAX_VARIANCE = 1e14
@@ -82,27 +75,14 @@ def area_section(message: PoseWithCovarianceStamped) -> str:
     return str(area_from_frame(frame))
 
 
-def graph_section(message: MarkerArray) -> dict[str, Any]:
-    """Areas and arcs of the map with their ellipses, m and rad in the map.
+def planar_pose(message: Pose) -> list[float]:
+    """x, y, m, and heading, rad, of a pose.
 
-    :raises HmtSlamError: where a number is not finite, or there are too many markers or points.
+    :raises HmtSlamError: where a number is not finite, or the orientation is no rotation.
     """
-    if len(message.markers) > _MAX_MARKERS:
-        raise HmtSlamError(f"a graph has {len(message.markers)} markers, more than {_MAX_MARKERS}: it is not shown")
-    groups: dict[str, dict[int, Marker]] = {}
-    for marker in message.markers:
-        groups.setdefault(marker.ns, {})[marker.id] = marker
-    area_ellipses, arc_ellipses = groups.get("area_uncertainty", {}), groups.get("arc_uncertainty", {})
-    areas = [
-        {"area": number, "at": _xy(disc.pose.position), **_uncertainty(area_ellipses.get(number))}
-        for number, disc in groups.get("areas", {}).items()
-    ]
-    arcs = [
-        {"closure": group == "closures", "ends": _ends(line), **_uncertainty(arc_ellipses.get(number))}
-        for group in ("arcs", "closures")
-        for number, line in groups.get(group, {}).items()
-    ]
-    return {"areas": areas, "arcs": arcs}
+    _check_pose(message)
+    x, y, theta = pose_from_message(message).tolist()
+    return [round(x, 3), round(y, 3), round(theta, 4)]
 
 
 def map_cells(message: OccupancyGrid) -> NDArray[np.int8]:
@@ -146,26 +126,6 @@ def _check_pose(pose: Pose) -> None:
 def _check_all(values: Iterable[float], name: str, reach: float) -> None:
     for value in values:
         finite(float(value), name, reach)
-
-
-def _ends(line: Marker) -> list[list[float]]:
-    if len(line.points) > _MAX_LINE_POINTS:
-        raise HmtSlamError(f"an arc has {len(line.points)} points instead of 2: look who publishes it")
-    return [_xy(point) for point in line.points]
-
-
-def _uncertainty(marker: Marker | None) -> dict[str, Any]:
-    """Half axes and angle of an ellipse, and its text."""
-    if marker is None:
-        return {"ellipse": None, "text": "It is not known where this is in the map."}
-    _check_pose(marker.pose)
-    _check_all((marker.scale.x, marker.scale.y), "scale", MAX_COORDINATE)
-    ellipse = [0.5 * marker.scale.x, 0.5 * marker.scale.y, float(pose_from_message(marker.pose)[2])]
-    return {"ellipse": [round(v, 4) for v in ellipse], "text": marker.text[:_MAX_TEXT]}
-
-
-def _xy(point: Any) -> list[float]:  # noqa: ANN401  a ROS point
-    return [round(finite(value, "position", MAX_COORDINATE), 3) for value in (point.x, point.y)]
 
 
 _LEVELS = {"good": DiagnosticStatus.OK, "attention": DiagnosticStatus.WARN, "fault": DiagnosticStatus.ERROR}

@@ -15,15 +15,16 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Bool, Float64, String
-from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.documents import KeyframeHeader, RobotStatus
-from hmt_slam_ros.messages.messages import Hypotheses
+from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses
+from hmt_slam_ros.messages.topology import Topology
 from hmt_slam_ros.process_table import TEAM, process_names, producer
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, SYSTEM, NodeDiagnostics, is_of_other_namespace
 from hmt_slam_ros.ros.guarded_node import GuardedNode
+from hmt_slam_ros.ros.map_layers import MapLayers
 from hmt_slam_ros.ros.message_io import document_callback
 from hmt_slam_ros.ros.parameters import declare_system
 from hmt_slam_ros.ros.team_view import TeamView
@@ -31,7 +32,6 @@ from hmt_slam_ros.ros.topics import (
     DIAGNOSTICS,
     DOCUMENTS,
     ENTROPY,
-    GRAPH,
     HMT_POSE,
     INCIDENTS,
     IS_LOCALIZED,
@@ -42,7 +42,6 @@ from hmt_slam_ros.ros.topics import (
 from hmt_slam_ros.ros.view_conversions import (
     area_section,
     finite,
-    graph_section,
     incident_message,
     map_cells,
     map_section,
@@ -52,6 +51,7 @@ from hmt_slam_ros.untrusted_input import shorten
 from hmt_slam_ros.view.board import Board, KeyframeHistory
 from hmt_slam_ros.view.health import SystemHealth
 from hmt_slam_ros.view.incidents import IncidentLog
+from hmt_slam_ros.view.run_events import RunEvents
 from hmt_slam_ros.view.server import LOCAL, PORT, PageServer, grid_png
 
 _PERIOD = 0.2
@@ -78,7 +78,7 @@ _ALLOWED_HOSTS = ParameterDescriptor(
 _PUBLISHERS = {
     POSE: producer("RealTimePose"),
     HMT_POSE: producer("RealTimePose"),
-    GRAPH: producer("ClosureDecision"),
+    DOCUMENTS[Topology]: producer("ClosureDecision"),
     MAP: producer("ClosureDecision"),
     KEYFRAMES: producer("Keyframe"),
     DOCUMENTS[Hypotheses]: producer("Hypotheses"),
@@ -100,7 +100,8 @@ class ViewNode(GuardedNode):
         super().__init__(name)
         self.diagnostics = NodeDiagnostics(self, declare_system(self))
         self.board = Board()
-        self._health, self._history = SystemHealth(process_names()), KeyframeHistory(self.board)
+        self._health, self._history = SystemHealth(process_names()), KeyframeHistory(self.board, self._begin_run)
+        self._events = RunEvents()
         self._incidents = IncidentLog()
         self._incident_publisher = self.create_publisher(DiagnosticArray, INCIDENTS, topics.INCIDENT_HISTORY)
         self._message_times: dict[str, float] = {}
@@ -114,14 +115,13 @@ class ViewNode(GuardedNode):
         self._subscribe(
             PoseWithCovarianceStamped, HMT_POSE, lambda m: self.board.put("area", area_section(m)), topics.NEWEST
         )
-        self._subscribe(MarkerArray, GRAPH, self._on_graph, topics.LATCHED)
-        for kind in (KeyframeHeader, Hypotheses):
-            self._subscribe(
-                String,
-                DOCUMENTS[kind],
-                document_callback(self.diagnostics, kind, self._history.add),
-                topics.CHAIN_HISTORY,
-            )
+        for kind, callback in (
+            (KeyframeHeader, self._on_keyframe),
+            (Hypotheses, self._on_hypotheses),
+            (ClosureDecision, self._events.add),
+        ):
+            on_document = document_callback(self.diagnostics, kind, callback)
+            self._subscribe(String, DOCUMENTS[kind], on_document, topics.CHAIN_HISTORY)
         self._subscribe(Bool, IS_LOCALIZED, self._on_localized, topics.LATCHED)
         self._subscribe(
             Float64, ENTROPY, lambda m: self.board.put("entropy", round(finite(m.data, "entropy"), 3)), topics.LATCHED
@@ -130,6 +130,7 @@ class ViewNode(GuardedNode):
         self._subscribe(String, DOCUMENTS[RobotStatus], on_status, topics.LATCHED)
         self._subscribe(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, topics.STREAM)
         self._team = TeamView(self.board, self._subscribe, self.destroy_subscription)
+        self._layers = MapLayers(self.board, self._subscribe, self.destroy_subscription, self.diagnostics)
         self._publish_health()
         self.get_logger().info(f"the page is at {self._server.url}")
 
@@ -171,6 +172,8 @@ class ViewNode(GuardedNode):
                 self._listening_time, last = self._listening_time + min(now - last, _LONGEST_STEP), now
                 self._spin_pending(executor)
                 self._history.publish_complete()
+                self._layers.update()
+                self.board.put("events", self._events.rows())
                 self._publish_health()
                 self._update_map_subscription()
                 self._team.update()
@@ -201,6 +204,7 @@ class ViewNode(GuardedNode):
         self.board.put("nodes", self._health.rows(now))
         for incident in self._incidents.update(self._health.nodes, now, time.time()):
             self.get_logger().info(f"{incident.node}: {incident.text}")
+            self._events.add_incident(f"{incident.node}: {incident.text}")
             self._incident_publisher.publish(incident_message(incident, self.get_namespace()))
         self.board.put("incidents", self._incidents.rows())
         times = self._message_times
@@ -212,8 +216,17 @@ class ViewNode(GuardedNode):
         self.board.put("robot", robot_section(message))
         self._health.last_pose_at = self._listening_time
 
-    def _on_graph(self, message: MarkerArray) -> None:
-        self.board.put("graph", graph_section(message))
+    def _on_keyframe(self, header: KeyframeHeader) -> None:
+        self._history.add(header)
+        self._layers.sections.add_keyframe(header)
+
+    def _on_hypotheses(self, hypotheses: Hypotheses) -> None:
+        self._history.add(hypotheses)
+        self._events.add(hypotheses)
+
+    def _begin_run(self) -> None:
+        self._events.clear()
+        self._layers.sections.clear()
 
     def _on_localized(self, message: Bool) -> None:
         self._health.is_localized = message.data

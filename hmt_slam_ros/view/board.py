@@ -7,7 +7,7 @@ import json
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,6 +17,8 @@ from hmt_slam_ros.messages.documents import KeyframeHeader
 from hmt_slam_ros.messages.messages import Hypotheses
 from hmt_slam_ros.sensors.plausibility import MAX_STAMP
 from hmt_slam_ros.untrusted_input import shorten
+from hmt_slam_ros.view.run_ring import RunRing
+from hmt_slam_ros.view.wall_points import WallPoints
 
 _MAX_BARS = 12
 """Hypotheses of an event that the page shows. It adds the others, the least probable, to the unexamined probability."""
@@ -31,8 +33,9 @@ _RECONNECT_TIME = 10.0
 class KeyframeHistory:
     """Joins keyframes, which have the time, with the hypotheses that answer them: the two have separate topics."""
 
-    def __init__(self, board: Board) -> None:
-        self._board = board
+    def __init__(self, board: Board, on_new_run: Callable[[], None] = lambda: None) -> None:
+        """:param on_new_run: called where a known event has another stamp."""
+        self._board, self._on_new_run = board, on_new_run
         self._headers: dict[int, KeyframeHeader] = {}
         self._answers: dict[int, Hypotheses] = {}
         self._published_stamps: dict[int, int] = {}
@@ -60,6 +63,7 @@ class KeyframeHistory:
             if self._published_stamps and sequence <= max(self._published_stamps):
                 self._published_stamps = {}
                 self._board.clear_history()
+                self._on_new_run()
             self._published_stamps[sequence] = header.scan.stamp
             while len(self._published_stamps) > HISTORY_LENGTH:
                 del self._published_stamps[min(self._published_stamps)]
@@ -115,7 +119,11 @@ class ClientState:
 
 
 class Board:
-    """Sections that are replaced, a history of events that grows, and the picture of the map. Thread-safe."""
+    """Sections that are replaced, a history of events that grows, and the picture of the map. Thread-safe.
+
+    :ivar past: snapshots of the map.
+    :ivar walls: surfaces that keyframes saw.
+    """
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
@@ -125,6 +133,7 @@ class Board:
         self._event_count, self._generation = 0, 0
         self._watchers, self._last_watched = 0, -_RECONNECT_TIME
         self._map_images: dict[str, tuple[bytes, str]] = {}
+        self.past, self.walls = RunRing(), WallPoints()
 
     def put(self, section: str, content: Any) -> None:  # noqa: ANN401  any JSON value
         """Replace a section, unless it is equal.

@@ -35,13 +35,15 @@ LOCAL, PORT = "127.0.0.1", 8800
 PAGE = Path(__file__).parent / "page"
 """Folder of the page's files."""
 
-_FILES = {
-    "/": ("index.html", "text/html; charset=utf-8"),
-    "/view.css": ("view.css", "text/css; charset=utf-8"),
-    "/view.js": ("view.js", "text/javascript; charset=utf-8"),
-    "/draw.js": ("draw.js", "text/javascript; charset=utf-8"),
-}
-"""{path of a request: (file, content type)}."""
+_KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".txt": "text/plain"}
+"""{suffix of a file: its content type}."""
+
+_FILES = {f"/{path.name}": path for path in sorted(PAGE.iterdir()) if path.suffix in _KINDS}
+_FILES["/"] = _FILES.pop("/index.html")
+"""{path of a request: file}."""
+
+_MAX_NUMBER = 10**12
+"""Largest number in a request."""
 
 _PERIOD = 0.2
 """Least time between two events of a stream, s."""
@@ -169,6 +171,12 @@ class _RequestReader:
         self._file.close()
 
 
+def _number(query: dict[str, list[str]], name: str) -> int:
+    """A whole number of a request, 0 where there is none."""
+    text = "".join(query.get(name, []))
+    return min(int(text), _MAX_NUMBER) if text.isascii() and text.isdigit() and len(text) < 20 else 0
+
+
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "hmt_slam_view", ""
@@ -201,17 +209,29 @@ class _Handler(BaseHTTPRequestHandler):
         if objection:
             self._answer(HTTPStatus.FORBIDDEN, "text/plain", objection.encode())
         elif path in _FILES:
-            name, kind = _FILES[path]
-            self._answer(HTTPStatus.OK, kind, (PAGE / name).read_bytes())
+            kind = f"{_KINDS[_FILES[path].suffix]}; charset=utf-8"
+            self._answer(HTTPStatus.OK, kind, _FILES[path].read_bytes())
         elif path == "/map.png":
             self._send_map_image("".join(parse_qs(query).get("robot", [])))
-        elif path == "/snapshot.json":
-            content = json.dumps(self.board.wait_for_changes(ClientState()), allow_nan=False).encode()
-            self._answer(HTTPStatus.OK, "application/json", content)
         elif path == "/news":
             self._stream()
         else:
-            self._answer(HTTPStatus.NOT_FOUND, "text/plain", b"there is no such page")
+            self._send_json(path, parse_qs(query))
+
+    def _send_json(self, path: str, query: dict[str, list[str]]) -> None:
+        """Answer with the whole board, with walls after some, or with the past at an event."""
+        if path == "/snapshot.json":
+            content = json.dumps(self.board.wait_for_changes(ClientState()), allow_nan=False).encode()
+        elif path == "/walls.json":
+            content = self.board.walls.answer(_number(query, "after"))
+        elif path == "/past.json":
+            content = self.board.past.content(_number(query, "event"))
+        else:
+            content = b""
+        if content:
+            self._answer(HTTPStatus.OK, "application/json", content)
+        else:
+            self._answer(HTTPStatus.NOT_FOUND, "text/plain", b"there is no such page, or nothing on it yet")
 
     def _send_map_image(self, robot: str) -> None:
         picture, tag = self.board.map_image(robot)

@@ -1,13 +1,15 @@
-// Pictures on canvases: the plan with map, areas, arcs and robot; and the course of the probabilities.
+// The plan on its canvas: map, areas, arcs, robot, and the layers above.
+
+import { compose } from "./scene.js";
 
 const GOLDEN = 0.6180339887498949;
 const FACTORS = [1, 2, 5, 10, 20, 50, 100];
 const VISIBLE = 14; // px, of the largest ellipse of an arc
 
-/** The colour of a hypothesis: neighbouring numbers are far apart. */
+/** The colour of a hypothesis, as in pmf.png: neighbouring numbers are far apart. */
 export function colour(hypothesis) {
   const hue = ((0.58 + hypothesis * GOLDEN) % 1) * 360;
-  return `hsl(${hue.toFixed(0)} 62% ${hypothesis % 2 ? 54 : 44}%)`;
+  return `hsl(${hue.toFixed(1)} 74% ${hypothesis % 2 ? 49 : 37}%)`;
 }
 
 /** A canvas with as many pixels as the screen has for it; returns its context and its size in CSS pixels. */
@@ -63,72 +65,114 @@ function rgb(hex) {
   return [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
 }
 
-/** From metres in the map to pixels of the canvas, and back. */
-export class Camera {
-  constructor() {
-    [this.x, this.y, this.scale] = [0, 0, 30];
-    [this.width, this.height] = [1, 1];
-  }
-
-  toScreen([x, y]) {
-    return [this.width / 2 + (x - this.x) * this.scale, this.height / 2 - (y - this.y) * this.scale];
-  }
-
-  toMap([u, v]) {
-    return [this.x + (u - this.width / 2) / this.scale, this.y - (v - this.height / 2) / this.scale];
-  }
-
-  /** Zoom so that what is under a pixel stays there. */
-  zoom(factor, pixel) {
-    const [x, y] = this.toMap(pixel);
-    this.scale = Math.min(2000, Math.max(0.5, this.scale * factor));
-    const [u, v] = this.toScreen([x, y]);
-    this.move(pixel[0] - u, pixel[1] - v);
-  }
-
-  move(du, dv) {
-    this.x -= du / this.scale;
-    this.y += dv / this.scale;
-  }
-
-  fit([left, bottom], [width, height]) {
-    this.x = left + width / 2;
-    this.y = bottom + height / 2;
-    this.scale = 0.9 * Math.min(this.width / Math.max(width, 4), this.height / Math.max(height, 4));
-  }
-}
-
-/** Draw the plan; returns what was drawn, and where: {areas, arcs, closures, robot, factor, map, middle, spots, team}. */
-export function drawPlan(canvas, camera, state, picture, trail, team) {
+/**
+ * Draw the plan: a scene, and the layers that are visible above it.
+ * Returns what was drawn, and where: counts by layer, {robot, factor, middle, spots, team}.
+ */
+export function drawPlan(canvas, camera, state, { scene, picture, walls, team, paint, others, robot, visible }) {
   const { context, width, height } = prepared(canvas);
   [camera.width, camera.height] = [width, height];
   context.fillStyle = themed("--unknown");
   context.fillRect(0, 0, width, height);
-  const drawn = { areas: 0, arcs: 0, closures: 0, robot: null, factor: 1, map: false, spots: [] };
-  drawn.middle = [camera.x, camera.y];
-  if (state.map && picture) {
-    const [left, bottom] = state.map.origin;
-    const [u, v] = camera.toScreen([left, bottom + state.map.size[1]]);
-    context.imageSmoothingEnabled = camera.scale * (state.map.size[0] / picture.width) < 1;
-    context.drawImage(picture, u, v, state.map.size[0] * camera.scale, state.map.size[1] * camera.scale);
+  const drawn = { factor: 1, map: false, spots: [], middle: [camera.x, camera.y], robot: null };
+  if (visible.map && state.map && picture) {
+    drawPicture(context, camera, state.map, picture);
     drawn.map = true;
   }
+  drawn.walls = visible.walls && walls ? walls.draw(context, camera, scene, themed("--wall")) : 0;
   drawn.team = team.map((other) => drawOther(context, camera, other));
-  drawTrail(context, camera, trail);
-  if (state.graph) {
-    drawn.factor = factorOf(state.graph, camera);
-    state.graph.arcs.forEach((arc) => drawArc(context, camera, arc, drawn.factor));
-    state.graph.areas.forEach((area) => drawArea(context, camera, area, area.area === Number(state.area)));
-    drawn.areas = state.graph.areas.length;
-    drawn.spots = state.graph.areas.map(({ area, at }) => ({ area, at: camera.toScreen(at).map(Math.round) }));
-    drawn.arcs = state.graph.arcs.length;
-    drawn.closures = state.graph.arcs.filter((arc) => arc.closure).length;
-  }
-  if (state.robot) {
-    drawRobot(context, camera, state.robot);
-    drawn.robot = state.robot.pose;
+  drawn.path = visible.path ? drawPath(context, camera, scene.path, paint ?? themed("--path")) : 0;
+  drawGraph(context, camera, scene, paint, visible, drawn);
+  drawLayers(context, camera, state, scene, robot, visible, drawn);
+  drawn.others = visible.others ? others.length : 0;
+  if (visible.others) others.forEach(({ pose, paint: own, name }) => drawArrow(context, camera, pose, own, name));
+  if (robot) {
+    drawRobot(context, camera, robot, paint, visible.covariances);
+    drawn.robot = robot.pose;
   }
   return drawn;
+}
+
+function drawPicture(context, camera, map, picture) {
+  const [u, v] = camera.toScreen([map.origin[0], map.origin[1] + map.size[1]]);
+  context.imageSmoothingEnabled = camera.scale * (map.size[0] / picture.width) < 1;
+  context.drawImage(picture, u, v, map.size[0] * camera.scale, map.size[1] * camera.scale);
+}
+
+function drawGraph(context, camera, scene, paint, visible, drawn) {
+  drawn.factor = factorOf(scene, camera);
+  const isShown = (arc) => visible[arc.closure ? "closures" : "arcs"] && (visible.candidates || !arc.candidate);
+  const arcs = scene.arcs.filter(isShown);
+  arcs.forEach((arc) => drawArc(context, camera, arc, visible.covariances ? drawn.factor : 0, paint));
+  if (visible.areas) {
+    if (visible.covariances) scene.areas.forEach((area) => drawSpread(context, camera, area.at, area.ellipse, themed("--area")));
+    scene.areas.forEach((area) => drawArea(context, camera, area, area.area === scene.area));
+  }
+  drawn.areas = visible.areas ? scene.areas.length : 0;
+  drawn.arcs = arcs.length;
+  drawn.closures = arcs.filter((arc) => arc.closure).length;
+  drawn.candidates = arcs.filter((arc) => arc.candidate).map((arc) => arc.numbers);
+  drawn.covariances = visible.covariances ? arcs.filter((arc) => arc.ellipse).length : 0;
+  drawn.spots = scene.areas.map(({ area, at }) => ({ area, at: camera.toScreen(at).map(Math.round) }));
+}
+
+/** Scan, particles, goals and marks; the first three are of now alone. */
+function drawLayers(context, camera, state, scene, robot, visible, drawn) {
+  const live = robot?.live ? robot.pose : null;
+  const scan = visible.scan && live ? state.scan ?? [] : [];
+  for (let k = 0; k < scan.length; k += 2) drawDot(context, camera, compose(live, [scan[k], scan[k + 1]]), themed("--scan"), 1.5);
+  const particles = visible.particles && live ? state.particles ?? [] : [];
+  particles.forEach((pose) => drawDot(context, camera, pose, themed("--particle"), 2));
+  const goals = [["goal", "Goal"], ["look", "A look decides"]].flatMap(([name, title]) =>
+    visible.goals && live && state[name] && Math.hypot(state[name][0] - live[0], state[name][1] - live[1]) > 0.5
+      ? [[state[name], title]] : []);
+  goals.forEach(([pose, title]) => drawSign(context, camera, pose, themed("--goal"), title, true));
+  const areas = new Map(scene.areas.map((area) => [area.area, area.pose]));
+  const marks = Object.entries(visible.marks ? state.marks ?? {} : {}).filter(([, mark]) => areas.has(mark.area));
+  marks.forEach(([name, mark]) => drawSign(context, camera, compose(areas.get(mark.area), mark.at), themed("--mark"), name, false));
+  Object.assign(drawn, { scan: scan.length / 2, particles: particles.length, goals: goals.length, marks: marks.length });
+}
+
+function drawDot(context, camera, at, paint, radius) {
+  const [u, v] = camera.toScreen(at);
+  context.fillStyle = paint;
+  context.fillRect(u - radius, v - radius, 2 * radius, 2 * radius);
+}
+
+/** A ring or a square with a name below. */
+function drawSign(context, camera, at, paint, name, isRound) {
+  const [u, v] = camera.toScreen(at);
+  context.strokeStyle = context.fillStyle = paint;
+  context.lineWidth = 2.5;
+  context.beginPath();
+  if (isRound) context.arc(u, v, 8, 0, 2 * Math.PI);
+  else context.rect(u - 5, v - 5, 10, 10);
+  context.stroke();
+  drawName(context, name, u, v + 11);
+}
+
+function drawName(context, name, u, v) {
+  context.font = "600 12px system-ui, sans-serif";
+  context.textAlign = "center";
+  context.textBaseline = "top";
+  context.lineWidth = 3;
+  context.strokeStyle = themed("--card");
+  context.strokeText(name, u, v);
+  context.fillStyle = themed("--ink");
+  context.fillText(name, u, v);
+}
+
+/** An ellipse with a faint inside. */
+function drawSpread(context, camera, at, half, paint) {
+  if (!half) return;
+  ellipse(context, camera, at, half);
+  context.fillStyle = context.strokeStyle = paint;
+  context.globalAlpha = 0.15;
+  context.fill();
+  context.globalAlpha = 0.6;
+  context.lineWidth = 1;
+  context.stroke();
+  context.globalAlpha = 1;
 }
 
 /** By how much the ellipses of arcs are drawn larger, so that one sees them. */
@@ -154,18 +198,19 @@ function drawOther(context, camera, { name, frame, map, robot, paint, picture })
   return { name, map: Boolean(map && picture), robot: Boolean(robot) };
 }
 
-function drawTrail(context, camera, trail) {
-  context.strokeStyle = themed("--path");
+function drawPath(context, camera, path, paint) {
+  context.strokeStyle = paint;
   context.lineWidth = 1.5;
   context.lineJoin = "round";
   context.beginPath();
-  trail.forEach((point, k) => {
+  path.forEach((point, k) => {
     const [u, v] = camera.toScreen(point);
-    const jump = k === 0 || Math.hypot(point[0] - trail[k - 1][0], point[1] - trail[k - 1][1]) > 5;
+    const jump = k === 0 || Math.hypot(point[0] - path[k - 1][0], point[1] - path[k - 1][1]) > 5;
     if (jump) context.moveTo(u, v);
     else context.lineTo(u, v);
   });
   context.stroke();
+  return path.length;
 }
 
 function ellipse(context, camera, at, [longer, shorter, angle], least = 0) {
@@ -175,18 +220,20 @@ function ellipse(context, camera, at, [longer, shorter, angle], least = 0) {
   context.ellipse(u, v, ...half, -angle, 0, 2 * Math.PI);
 }
 
-/** An arc that could be any is dashed. */
-function drawArc(context, camera, arc, factor) {
+/** An arc that not all hypotheses have is dashed; one that could lie anyhow is dotted. */
+function drawArc(context, camera, arc, factor, paint) {
   const [start, end] = arc.ends.map((point) => camera.toScreen(point));
-  context.strokeStyle = context.fillStyle = themed(arc.closure ? "--closure" : "--arc");
+  const own = arc.candidate && paint ? paint : themed(arc.closure ? "--closure" : "--arc");
+  context.strokeStyle = context.fillStyle = own;
   context.lineWidth = arc.closure ? 2.5 : 1.5;
-  context.setLineDash(arc.ellipse ? [] : [4, 6]);
+  if (arc.candidate) context.setLineDash([9, 6]);
+  else if (!arc.ellipse && !paint) context.setLineDash([2, 5]);
   context.beginPath();
   context.moveTo(...start);
   context.lineTo(...end);
   context.stroke();
   context.setLineDash([]);
-  if (!arc.ellipse) return;
+  if (!arc.ellipse || !factor) return;
   const [longer, shorter, angle] = arc.ellipse;
   ellipse(context, camera, middle(arc), [longer * factor, shorter * factor, angle], 1);
   context.globalAlpha = 0.3;
@@ -218,20 +265,10 @@ function drawArea(context, camera, area, here) {
   context.fillText(area.area, u, v + 0.5);
 }
 
-function drawRobot(context, camera, robot) {
-  const [x, y] = robot.pose;
-  const paint = themed("--robot");
-  context.fillStyle = context.strokeStyle = paint;
-  if (robot.ellipse) {
-    ellipse(context, camera, [x, y], robot.ellipse);
-    context.globalAlpha = 0.18;
-    context.fill();
-    context.globalAlpha = 0.7;
-    context.lineWidth = 1;
-    context.stroke();
-    context.globalAlpha = 1;
-  }
-  drawArrow(context, camera, robot.pose, paint);
+function drawRobot(context, camera, robot, paint, hasSpread) {
+  const own = paint ?? themed("--robot");
+  if (hasSpread) drawSpread(context, camera, robot.pose, robot.ellipse, own);
+  drawArrow(context, camera, robot.pose, own);
 }
 
 /** An arrow at a pose, with a name beside it where one is given. */
@@ -253,37 +290,5 @@ function drawArrow(context, camera, pose, paint, name = "") {
   context.lineWidth = 1.5;
   context.stroke();
   context.restore();
-  if (!name) return;
-  context.font = "600 12px system-ui, sans-serif";
-  context.textAlign = "center";
-  context.textBaseline = "top";
-  context.fillStyle = paint;
-  context.fillText(name, u, v + size);
-}
-
-/** Seconds from the first event to each; stamps may jump back, as where a bag begins anew. */
-export function seconds(events) {
-  let sum = 0;
-  return events.map((event, k) => (sum += k ? Math.max(0, event.time - events[k - 1].time) : 0));
-}
-
-/** Draw the course of the probabilities: a stack for every event, from it to the next. Returns the number of events. */
-export function drawCourse(canvas, events) {
-  const { context, width, height } = prepared(canvas);
-  context.fillStyle = themed("--ground");
-  context.fillRect(0, 0, width, height);
-  const times = seconds(events);
-  const span = Math.max(times.at(-1) ?? 0, 1);
-  const at = (k) => (k < times.length ? Math.round((times[k] / span) * (width - 3)) : width);
-  events.forEach((event, k) => {
-    let top = height;
-    // By number, so that the band of a hypothesis stays where it is.
-    for (const [hypothesis, , probability] of [...event.hypotheses].sort((one, other) => one[0] - other[0])) {
-      const size = probability * height;
-      context.fillStyle = colour(hypothesis);
-      context.fillRect(at(k), top - size, Math.max(at(k + 1) - at(k), 1), size);
-      top -= size;
-    }
-  });
-  return events.length;
+  if (name) drawName(context, name, u, v + size);
 }
