@@ -2,9 +2,10 @@
 
 import json
 import math
+import re
 import socket
 from array import array
-from urllib.request import urlopen
+from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import pytest
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Float64, String
@@ -24,6 +25,7 @@ from hmt_slam_ros.messages.topology import Topology, TopologyArea, TopologyHypot
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.map_layers import beams_of
 from hmt_slam_ros.ros.view_conversions import area_section, finite, map_cells, map_section, robot_section
+from hmt_slam_ros.view.commands import TOKEN_HEADER
 from hmt_slam_ros.view.topology_section import topology_section
 
 NAN, INFINITY = math.nan, math.inf
@@ -146,7 +148,7 @@ def test_the_node_survives_what_a_stranger_says_counts_it_and_shows_what_is_well
     entropies.publish(Float64(data=NAN))
     statuses.publish(String(data="hello"))
     port = free_port()
-    view = start("view", port=port)
+    view = start("view", port=port, controls="true")
     reports = listener.subscribe(DiagnosticArray, topics.DIAGNOSTICS, topics.STREAM)
 
     def counts():
@@ -183,3 +185,28 @@ def test_the_node_survives_what_a_stranger_says_counts_it_and_shows_what_is_well
         listener.until(lambda: {"robot", "map", "graph", "entropy"} <= snapshot(port).keys(), alive=[view])
     assert snapshot(port)["robot"]["pose"] == [4.0, 0.0, 0.0]
     assert snapshot(port)["entropy"] == 0.25
+    assert_commands(listener, view, port)
+
+
+def assert_commands(listener, view, port):
+    """A person who has the token, which is in the log, gives initial poses and goals."""
+    token = next(re.search("#token=(.*)$", line.strip())[1] for line in view.stderr if "#token=" in line)
+    initial_poses = listener.subscribe(PoseWithCovarianceStamped, topics.INITIAL_POSE, topics.STREAM)
+    goals = listener.subscribe(PoseStamped, topics.GOAL_POSE, topics.STREAM)
+    for topic in (topics.INITIAL_POSE, topics.GOAL_POSE):
+        listener.until(lambda topic=topic: listener.node.count_publishers(topic), alive=[view])
+
+    def command(**content):
+        headers = {"Content-Type": "application/json", "Origin": f"http://127.0.0.1:{port}", TOKEN_HEADER: token}
+        request = Request(f"http://127.0.0.1:{port}/command", data=json.dumps(content).encode(), headers=headers)
+        with urlopen(request, timeout=20) as answer:
+            assert answer.status == 202
+
+    command(kind="initial_pose", pose=[1.0, 2.0, 0.0])
+    command(kind="goal", pose=[3.0, 2.0, 0.0])
+    command(kind="save")
+    listener.until(lambda: initial_poses and goals, alive=[view])
+    assert (initial_poses[0].header.frame_id, initial_poses[0].pose.pose.position.x) == ("map", 1.0)
+    assert initial_poses[0].pose.covariance[0] == pytest.approx(0.25)
+    assert goals[0].pose.position.x == 3.0
+    listener.until(lambda: "slam/save does not answer" in snapshot(port)["command"]["text"], alive=[view])

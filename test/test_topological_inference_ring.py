@@ -61,7 +61,7 @@ def test_the_arc_that_closes_the_ring_is_precise(ring):
     assert away @ np.linalg.solve(value.pose.covariance, away) < 16.3
 
 
-def test_what_speaks_for_the_closure_is_said_in_lengths_and_ends_with_its_acceptance():
+def test_the_evidence_of_the_closure_is_given_in_lengths_and_ends_with_its_acceptance():
     run, _ = around_the_ring()
     best = run.replica.best_hypothesis
     a, b, _ = closures(run, best)[0]

@@ -11,6 +11,7 @@ from map_for_page import BEST, OTHER, alternatives, evidence, history, topology
 from hmt_slam_ros.messages.team import TeamPlacement, Verdict
 from hmt_slam_ros.results.plots import color_of
 from hmt_slam_ros.view.board import Board
+from hmt_slam_ros.view.commands import Commands
 from hmt_slam_ros.view.map_sections import MapSections
 from hmt_slam_ros.view.server import PageServer, grid_png
 from hmt_slam_ros.view.team_section import TeamSection
@@ -29,10 +30,11 @@ class Shown:
     """A board, and the page that shows it in a browser."""
 
     def __init__(self, folder):
-        self.board = Board()
-        self._server, self.browser = PageServer(self.board, "127.0.0.1", 0), Browser(folder / "profile")
+        self.board, self.commands = Board(), Commands(is_allowed=True)
+        self._server = PageServer(self.board, "127.0.0.1", 0, commands=self.commands)
+        self.url, self.browser = self._server.url, Browser(folder / "profile")
         self.browser.size(1280, 800)
-        self.browser.open(self._server.url)
+        self.browser.open(self.url)
 
     def text(self, name):
         return self.browser.evaluate(f"document.getElementById('{name}').innerText")
@@ -116,7 +118,7 @@ def screenshots(tmp_path):
 
 
 @pytest.fixture
-def mapped(page):
+def map_page(page):
     """The page with a map of two hypotheses; the walls and the past of its keyframes are there."""
     board, sections = page.board, MapSections(page.board)
     for keyframe in range(24):
@@ -144,35 +146,35 @@ def press(page, hypothesis):
     page.browser.evaluate(f"document.querySelector('[data-hypothesis=\"{hypothesis}\"]').click()")
 
 
-def test_a_selected_hypothesis_shows_its_map_its_pose_and_what_speaks_for_and_against_it(mapped, screenshots):
-    best = mapped.drawing
+def test_a_selected_hypothesis_shows_its_map_its_pose_and_what_speaks_for_and_against_it(map_page, screenshots):
+    best = map_page.drawing
     assert best["candidates"] == [[0, 5]]
     assert (best["closures"], best["others"], best["walls"], best["path"]) == (1, 1, 0, 24)
-    assert lines_of(mapped, "reasons") == [
+    assert lines_of(map_page, "reasons") == [
         "Area 5 #7 now 90.0 %",
         "closes 5 with 0, 60.0 % then",
         "12.4 m of walls match",
         "0.8 m of walls are seen through",
         "odometry and arcs alone: 3.0 %",
     ]
-    mapped.browser.screenshot(screenshots / "best_hypothesis.png")
-    press(mapped, OTHER)
-    mapped.until(lambda: mapped.drawing["selected"] == OTHER and mapped.drawing["walls"] == 24)
-    other = mapped.drawing
+    map_page.browser.screenshot(screenshots / "best_hypothesis.png")
+    press(map_page, OTHER)
+    map_page.until(lambda: map_page.drawing["selected"] == OTHER and map_page.drawing["walls"] == 24)
+    other = map_page.drawing
     assert (other["closures"], other["arcs"], other["areas"], other["path"]) == (0, 5, 6, 24)
     assert other["robot"] != best["robot"]
     shift = np.subtract(other["spots"][5]["at"], best["spots"][5]["at"])
     assert np.hypot(*shift) > 20
-    assert mapped.text("banner") == "Map under hypothesis Area 5 #12"
-    assert lines_of(mapped, "reasons") == [
+    assert map_page.text("banner") == "Map under hypothesis Area 5 #12"
+    assert lines_of(map_page, "reasons") == [
         "Area 5 #12 now 10.0 %",
         "is on new ground, area 5, 40.0 % then",
         "has no arc between 0 and 5, as the most probable one has",
     ]
-    mapped.browser.screenshot(screenshots / "other_hypothesis.png")
-    mapped.board.append_event({**history(25)[-1], "hypotheses": [[BEST, 5, 1.0, False]], "live": 1})
-    mapped.until(lambda: mapped.drawing["selected"] is None)
-    assert "Hypothesis #12 has ended" in mapped.text("hint")
+    map_page.browser.screenshot(screenshots / "other_hypothesis.png")
+    map_page.board.append_event({**history(25)[-1], "hypotheses": [[BEST, 5, 1.0, False]], "live": 1})
+    map_page.until(lambda: map_page.drawing["selected"] is None)
+    assert "Hypothesis #12 has ended" in map_page.text("hint")
 
 
 def test_the_colors_of_a_hypothesis_are_those_of_the_plots(page):
@@ -187,3 +189,103 @@ def test_the_colors_of_a_hypothesis_are_those_of_the_plots(page):
             }})"""
         )
         assert np.abs(np.subtract(found, expected)).max() <= 3, number
+
+
+def is_shown(page, name):
+    return page.browser.evaluate(f"document.getElementById('{name}').offsetParent !== null")
+
+
+def corner_of(page, selector):
+    """Left, top, width and height of an element, px."""
+    return page.browser.evaluate(
+        f"(({{left, top, width, height}}) => [left, top, width, height])"
+        f"(document.querySelector('{selector}').getBoundingClientRect())"
+    )
+
+
+def drag(page, start, end):
+    """Press at one pixel of the plan, and let go at another."""
+    left, top, _, _ = corner_of(page, "#plan")
+    for kind, (x, y) in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):
+        page.browser.send("Input.dispatchMouseEvent", type=kind, x=left + x, y=top + y, button="left", clickCount=1)
+
+
+def test_buttons_are_there_where_the_node_allows_them_for_those_who_have_the_token(map_page, screenshots):
+    page = map_page
+    assert not is_shown(page, "controls")
+    page.board.put("controls", True)
+    page.until(lambda: "open the page by the address that view logged" in page.text("outcome"))
+    assert not is_shown(page, "save")
+    page.browser.open("about:blank")
+    page.browser.open(f"{page.url}#token={page.commands.token}")
+    page.until(lambda: page.drawing.get("areas") == 6 and is_shown(page, "save"))
+    page.browser.evaluate("document.getElementById('save').click()")
+    page.until(lambda: [command.kind for command in page.commands.take()] == ["save"])
+    page.browser.evaluate("document.getElementById('goal').click()")
+    spot = page.drawing["spots"][3]
+    drag(page, spot["at"], [spot["at"][0], spot["at"][1] - 60])
+    taken = []
+    page.until(lambda: taken.extend(page.commands.take()) or taken)
+    assert (taken[0].kind, taken[0].area) == ("goal", 3)
+    assert np.allclose(taken[0].pose, [-10.0, 0.0, 0.5 * np.pi], atol=0.1)
+    middle = page.drawing["middle"]
+    page.board.put("command", {"level": "good", "text": "goal -10.00, 0.00 m", "paused": True})
+    page.until(lambda: page.text("outcome") == "goal -10.00, 0.00 m" and page.text("pause") == "Go on")
+    assert page.drawing["middle"] == middle
+    page.browser.screenshot(screenshots / "buttons.png")
+    page.board.put("controls", False)
+    page.until(lambda: not is_shown(page, "controls"))
+
+
+def test_the_path_and_the_past_are_whole_after_a_reload(map_page, screenshots):
+    page = map_page
+    page.browser.open("about:blank")
+    page.browser.open(page.url)
+    page.until(lambda: page.drawing.get("path") == 24 and page.drawing["events"] == 24)
+    assert page.text("when") == "now"
+    page.browser.evaluate(
+        "(() => { const time = document.getElementById('time'); time.value = 1; "
+        "time.dispatchEvent(new Event('input')) })()"
+    )
+    page.until(lambda: page.drawing["past"] == 15 and page.drawing["walls"] == 16)
+    assert (page.drawing["path"], page.drawing["areas"]) == (16, 4)
+    assert page.text("live") == "2 live after 8 m"
+    assert page.text("when") == "0:08 of 0:16"
+    assert page.text("banner") == "Map of the past"
+    page.browser.screenshot(screenshots / "past.png")
+    page.browser.evaluate("document.getElementById('now').click()")
+    page.until(lambda: page.drawing["past"] is None and page.drawing["path"] == 24)
+
+
+def test_layers_are_hidden_and_shown(map_page):
+    page = map_page
+    page.board.put("scan", [1.0, 0.0, 1.0, 0.5])
+    page.board.put("particles", [[10.0, 0.1, 0.0]])
+    page.board.put("goal", [3.0, 4.0, 0.0])
+    page.board.put("look", [10.1, 0.0, 0.0])  # the robot is there
+    page.board.put("marks", {"lift 2": {"area": 1, "at": [0.5, 0.0]}, "door": {"area": 99, "at": [0.0, 0.0]}})
+    counts = {"scan": 2, "particles": 1, "goals": 1, "marks": 1, "areas": 6, "path": 24, "arcs": 6, "covariances": 6}
+    page.until(lambda: {name: page.drawing[name] for name in counts} == counts)
+    for name, count in counts.items():
+        box = f"document.querySelector('[data-layer={name}]')"
+        page.browser.evaluate(f"{box}.click()")
+        page.until(lambda name=name, count=count: page.drawing[name] < count)
+        page.browser.evaluate(f"{box}.click()")
+        page.until(lambda name=name, count=count: page.drawing[name] == count)
+    legend = page.browser.evaluate("document.getElementById('legend').textContent")
+    for title in ("Scan", "Particles", "Goals", "Marks", "Path, corrected"):
+        assert title in legend
+
+
+def test_the_chart_has_axes_and_says_what_is_under_the_pointer(map_page):
+    page = map_page
+    page.board.put("events", [{"event": 12, "kind": "accepted", "text": "closure of 2 with 0 accepted"}])
+    left, top, width, height = corner_of(page, ".u-over")
+
+    def reading():
+        x, y = left + width * 12.2 / 23.0, top + 0.5 * height
+        page.browser.send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        return page.text("reading")
+
+    page.until(lambda: "accepted" in reading())
+    assert reading() == "0:12: #7 area 5 90.0 %, #12 area 5 10.0 % · closure of 2 with 0 accepted"

@@ -157,7 +157,8 @@ def test_messages_are_streamed_and_viewers_are_counted(board, server):
 
 def test_a_page_of_another_site_gets_nothing(server):
     assert status_of(Request(server.url + "snapshot.json", headers={"Host": "evil.example"})) == 403
-    assert status_of(Request(server.url + "snapshot.json", data=b"{}")) == 501
+    assert status_of(Request(server.url + "snapshot.json", data=b"{}")) == 403
+    assert status_of(Request(server.url + "snapshot.json", data=b"{}", method="PUT")) == 501
     with urlopen(Request(server.url + "snapshot.json", headers={"Host": "localhost:8800"}), timeout=10) as answer:
         assert json.load(answer) == {"history": {"anew": True, "events": []}}
 

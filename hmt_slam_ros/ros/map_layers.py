@@ -121,7 +121,7 @@ class MapLayers:
 
     def _on_particles(self, message: PoseArray) -> None:
         if len(message.poses) > _MAX_PARTICLES:
-            raise HmtSlamError(f"{len(message.poses)} particles are too many to be shown: look who publishes them")
+            raise HmtSlamError(f"{len(message.poses)} particles are too many to be shown: look who publishes it")
         self._board.put("particles", [planar_pose(pose) for pose in message.poses])
 
     def _on_place(self, place: PlaceEstimate) -> None:
@@ -139,5 +139,5 @@ def beams_of(message: LaserScan) -> LaserBeams:
         raise HmtSlamError(f"a scan of {len(message.ranges)} beams is too large to be shown: look who publishes it")
     angles = finite(message.angle_min, "angle_min", 100.0), finite(message.angle_increment, "angle_increment", 100.0)
     if np.isnan(message.range_min) or np.isnan(message.range_max):
-        raise HmtSlamError("range_min or range_max of a scan is NaN: correct the driver")
+        raise HmtSlamError("range_min or range_max of a scan is NaN: look who publishes it")
     return LaserBeams(ranges_from_message(message), *angles, float(message.range_min), float(message.range_max))

@@ -39,6 +39,7 @@ from hmt_slam_ros.ros.topics import (
     MAP,
     POSE,
 )
+from hmt_slam_ros.ros.view_controls import ViewControls
 from hmt_slam_ros.ros.view_conversions import (
     area_section,
     finite,
@@ -49,6 +50,7 @@ from hmt_slam_ros.ros.view_conversions import (
 )
 from hmt_slam_ros.untrusted_input import shorten
 from hmt_slam_ros.view.board import Board, KeyframeHistory
+from hmt_slam_ros.view.commands import Commands
 from hmt_slam_ros.view.health import SystemHealth
 from hmt_slam_ros.view.incidents import IncidentLog
 from hmt_slam_ros.view.run_events import RunEvents
@@ -73,6 +75,10 @@ _PORT = ParameterDescriptor(
 )
 _ALLOWED_HOSTS = ParameterDescriptor(
     description="Host names, separated by commas, under which the page is served, beside those of this computer.",
+    read_only=True,
+)
+_CONTROLS = ParameterDescriptor(
+    description="Whether the page has buttons for save, pause, initial pose and goal, for those who have its token.",
     read_only=True,
 )
 _PUBLISHERS = {
@@ -109,7 +115,8 @@ class ViewNode(GuardedNode):
         # In s; it stands still with the computer, so that no topic seems silent after that.
         self._listening_time = 0.0
         self._map_subscription: Any = None
-        self._server = PageServer(self.board, *self._declare_address())
+        commands = Commands(is_allowed=self._declare_controls())
+        self._server = PageServer(self.board, *self._declare_address(), commands)
         self.board.put("about", {"namespace": self.get_namespace()})
         self._subscribe(PoseWithCovarianceStamped, POSE, self._on_pose, topics.NEWEST)
         self._subscribe(
@@ -131,8 +138,10 @@ class ViewNode(GuardedNode):
         self._subscribe(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, topics.STREAM)
         self._team = TeamView(self.board, self._subscribe, self.destroy_subscription)
         self._layers = MapLayers(self.board, self._subscribe, self.destroy_subscription, self.diagnostics)
+        self._controls = ViewControls(self, self.board, commands, lambda: self._layers.sections.frame)
         self._publish_health()
-        self.get_logger().info(f"the page is at {self._server.url}")
+        key = f"#token={commands.token}" if commands.token else ""
+        self.get_logger().info(f"the page is at {self._server.url}{key}")
 
     def _declare_address(self) -> tuple[str, int, list[str]]:
         """Declare ``address``, ``port`` and ``allowed_hosts``, and return them.
@@ -148,6 +157,16 @@ class ViewNode(GuardedNode):
                 f"address or port of the page is none ({fault}): give such as -p address:={LOCAL} -p port:={PORT}"
             ) from fault
         return str(address), int(port), str(allowed_hosts).split(",")
+
+    def _declare_controls(self) -> bool:
+        """Declare ``controls``, and return it.
+
+        :raises HmtSlamError: for an invalid value.
+        """
+        try:
+            return bool(self.declare_parameter("controls", False, _CONTROLS).value)
+        except InvalidParameterTypeException as fault:
+            raise HmtSlamError(f"controls is true or false ({fault}): give -p controls:=true") from fault
 
     def _subscribe(self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile) -> Any:  # noqa: ANN401
         """Subscribe, and count messages; return rclpy's subscription."""
@@ -173,6 +192,7 @@ class ViewNode(GuardedNode):
                 self._spin_pending(executor)
                 self._history.publish_complete()
                 self._layers.update()
+                self._controls.update()
                 self.board.put("events", self._events.rows())
                 self._publish_health()
                 self._update_map_subscription()

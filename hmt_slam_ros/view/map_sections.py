@@ -65,10 +65,13 @@ class LaserBeams:
 
 
 class MapSections:
-    """Puts the layers of the map on the board."""
+    """Puts the layers of the map on the board.
+
+    :ivar frame: name of the map's frame.
+    """
 
     def __init__(self, board: Board) -> None:
-        self._board = board
+        self._board, self.frame = board, "map"
         self._geometries: dict[int, ScanGeometry] = {}
         self._beams: dict[int, LaserBeams] = {}
         self._geometry: ScanGeometry | None = None
@@ -80,6 +83,7 @@ class MapSections:
         :raises HmtSlamError: where it cannot be shown.
         """
         section = topology_section(topology)
+        self.frame = topology.frame
         self._board.put("graph", section)
         if topology.events:
             self._board.past.add(topology.events - 1, section["time"], section)

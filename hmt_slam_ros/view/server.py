@@ -1,4 +1,4 @@
-"""The server of the live page: its files, the picture of the map and a stream of changes; it is read-only."""
+"""The server of the live page: its files, the picture of the map, a stream of changes, and commands if allowed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.untrusted_input import shorten
 from hmt_slam_ros.view.board import Board, ClientState
+from hmt_slam_ros.view.commands import MAX_COMMAND, Commands, PageCommand, parse_command
 from hmt_slam_ros.view.connections import IDLE_TIME, BoundedServer, Streams
 from hmt_slam_ros.view.host_check import HostCheck
 
@@ -42,8 +44,8 @@ _FILES = {f"/{path.name}": path for path in sorted(PAGE.iterdir()) if path.suffi
 _FILES["/"] = _FILES.pop("/index.html")
 """{path of a request: file}."""
 
-_MAX_NUMBER = 10**12
-"""Largest number in a request."""
+_MAX_DIGITS = 16
+"""Digits of a number in a request, and one more."""
 
 _PERIOD = 0.2
 """Least time between two events of a stream, s."""
@@ -97,19 +99,33 @@ class PageServer:
     :ivar url: of the page.
     """
 
-    def __init__(self, board: Board, address: str, port: int, allowed_hosts: Iterable[str] = ()) -> None:
+    def __init__(
+        self,
+        board: Board,
+        address: str,
+        port: int,
+        allowed_hosts: Iterable[str] = (),
+        commands: Commands | None = None,
+    ) -> None:
         """Start to listen.
 
         :param address: IP address of the interface to listen on.
         :param port: TCP port, 0 for any free one.
         :param allowed_hosts: host names under which the page is served, beside those of this computer.
+        :param commands: where commands of browsers wait; None where none are allowed.
         :raises HmtSlamError: where the address is invalid or the port is taken.
         """
         try:
             version = ipaddress.ip_address(address).version
         except ValueError:
             raise HmtSlamError(f"address = {address} is no IP address: give 127.0.0.1, or 0.0.0.0 for all") from None
-        attributes = {"board": board, "hosts": HostCheck(allowed_hosts), "streams": Streams(_MAX_STREAMS)}
+        commands = Commands() if commands is None else commands
+        attributes = {
+            "board": board,
+            "hosts": HostCheck(allowed_hosts),
+            "streams": Streams(_MAX_STREAMS),
+            "commands": commands,
+        }
         handler = type("_BoardHandler", (_Handler,), attributes)
         self._server = _bind_server(address, port, handler)
         self.url = f"http://{f'[{address}]' if version == 6 else address}:{self._server.server_port}/"
@@ -166,15 +182,26 @@ class _RequestReader:
             raise OSError(f"a request of more than {_MAX_HEADER} bytes")
         return line
 
+    def read(self, length: int) -> bytes:
+        """So many bytes behind the lines, or fewer where the request is too long or ends."""
+        content = self._file.read(min(length, self._left))
+        self._left -= len(content)
+        return content
+
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
 
 def _number(query: dict[str, list[str]], name: str) -> int:
-    """A whole number of a request, 0 where there is none."""
-    text = "".join(query.get(name, []))
-    return min(int(text), _MAX_NUMBER) if text.isascii() and text.isdigit() and len(text) < 20 else 0
+    """A whole number of a request, 0 where there is none.
+
+    :raises HmtSlamError: where it is no whole number.
+    """
+    text = "".join(query.get(name, ["0"]))
+    if not (text.isascii() and text.isdigit() and len(text) < _MAX_DIGITS):
+        raise HmtSlamError(f"{name} = {shorten(text)} is no whole number: give one such as {name}=0")
+    return int(text)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -184,6 +211,7 @@ class _Handler(BaseHTTPRequestHandler):
     board: Board
     hosts: HostCheck
     streams: Streams
+    commands: Commands
 
     def setup(self) -> None:
         """Bound what is read."""
@@ -216,7 +244,38 @@ class _Handler(BaseHTTPRequestHandler):
         elif path == "/news":
             self._stream()
         else:
-            self._send_json(path, parse_qs(query))
+            try:
+                self._send_json(path, parse_qs(query))
+            except HmtSlamError as fault:
+                self._answer(HTTPStatus.BAD_REQUEST, "text/plain; charset=utf-8", str(fault).encode())
+
+    def do_POST(self) -> None:
+        """Take a command, where the node allows it; answers with a sentence where it is refused."""
+        self._mark(is_idle=False)
+        self.close_connection = True
+        refusal = self.hosts.objection(self.headers, self.connection.getsockname()[0])
+        refusal = refusal or self.commands.objection(self.headers)
+        if refusal:
+            self._answer(HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", refusal.encode())
+            return
+        try:
+            self.commands.put(self._read_command())
+        except HmtSlamError as fault:
+            self._answer(HTTPStatus.BAD_REQUEST, "text/plain; charset=utf-8", str(fault).encode())
+        else:
+            self._answer(HTTPStatus.ACCEPTED, "application/json", b"{}")
+
+    def _read_command(self) -> PageCommand:
+        """The command of the request.
+
+        :raises HmtSlamError: where it is none.
+        """
+        length = self.headers.get("Content-Length", "")
+        if self.path != "/command" or self.headers.get_content_type() != "application/json":
+            raise HmtSlamError("a command is JSON that is posted to /command")
+        if not (length.isascii() and length.isdigit() and len(length) < 5 and 0 < int(length) <= MAX_COMMAND):
+            raise HmtSlamError(f"a command has 1 to {MAX_COMMAND} bytes: give its Content-Length")
+        return parse_command(self._reader.read(int(length)).decode(errors="replace"))
 
     def _send_json(self, path: str, query: dict[str, list[str]]) -> None:
         """Answer with the whole board, with walls after some, or with the past at an event."""

@@ -57,7 +57,7 @@ def topology_section(topology: Topology) -> dict[str, Any]:
         "best": topology.hypotheses[0].hypothesis if topology.hypotheses else None,
         "hypotheses": [[h.hypothesis, round(h.probability, 5), h.area] for h in topology.hypotheses],
         "area": topology.area,
-        "robot": _rounded(topology.pose),
+        "robot": _round_pose(topology.pose),
         "areas": [_area(area) for area in topology.areas],
         "arcs": [_arc(arc, poses[arc.source]) for arc in topology.arcs if arc.source in poses and arc.target in poses],
     }
@@ -109,11 +109,11 @@ def _percent(share: float) -> str:
 def _alternative(one: Alternative) -> dict[str, Any]:
     return {
         "area": one.area,
-        "robot": _rounded(one.pose),
+        "robot": _round_pose(one.pose),
         "areas": [
-            {"area": area.area, "pose": _rounded(area.pose)}
+            {"area": area.area, "pose": _round_pose(area.pose)}
             | (
-                {"keyframes": list(area.keyframes), "poses": [_rounded(pose) for pose in area.poses]}
+                {"keyframes": list(area.keyframes), "poses": [_round_pose(pose) for pose in area.poses]}
                 if area.has_own_keyframes
                 else {}
             )
@@ -129,7 +129,7 @@ def _area(area: TopologyArea) -> dict[str, Any]:
     text = f"Area {area.area} in the map: {_deviation_text(area.pose)}"
     return {
         "area": area.area,
-        "pose": _rounded(area.pose.mean),
+        "pose": _round_pose(area.pose.mean),
         **_uncertainty(area.pose, area.pose, text),
         "keyframes": list(area.keyframes),
         "poses": poses,
@@ -161,6 +161,6 @@ def _deviation_text(belief: PoseGaussian) -> str:
     return f"±{belief.position_ellipse().semi_major / ELLIPSE_95:.2f} m, ±{turn:.1f}°"
 
 
-def _rounded(pose: Pose) -> list[float]:
+def _round_pose(pose: Pose) -> list[float]:
     x, y, theta = pose.tolist()
     return [round(x, 3), round(y, 3), round(theta, 4)]

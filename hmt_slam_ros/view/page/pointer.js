@@ -1,13 +1,17 @@
 // Pointer, wheel and keys on the plan: move, zoom with two fingers, click.
 
-/** Listen to what people do on the plan; calls back {moved, zoomed, wanted(mode), clicked(pixel)}. */
-export function listen(plan, camera, { moved, zoomed, wanted, clicked }) {
+/**
+ * Listen to what people do on the plan; calls back {moved, zoomed, turned, wanted(mode), clicked(pixel)}.
+ * While the controls wait for a pose, a drag is that pose.
+ */
+export function listen(plan, camera, { moved, zoomed, turned, wanted, clicked }, controls) {
   const pointers = new Map();
   let travelled = 0;
   plan.addEventListener("pointerdown", (event) => {
     plan.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
     travelled = 0;
+    controls.begin([event.offsetX, event.offsetY]);
   });
   plan.addEventListener("pointermove", (event) => {
     const before = pointers.get(event.pointerId);
@@ -16,6 +20,10 @@ export function listen(plan, camera, { moved, zoomed, wanted, clicked }) {
     const [du, dv] = [now[0] - before[0], now[1] - before[1]];
     travelled += Math.hypot(du, dv);
     pointers.set(event.pointerId, now);
+    if (controls.turn(now)) {
+      turned();
+      return;
+    }
     if (travelled < 4) return;
     const others = [...pointers].filter(([id]) => id !== event.pointerId);
     if (others.length === 1) {
@@ -31,6 +39,7 @@ export function listen(plan, camera, { moved, zoomed, wanted, clicked }) {
   for (const kind of ["pointerup", "pointercancel"]) {
     plan.addEventListener(kind, (event) => {
       pointers.delete(event.pointerId);
+      if (controls.end(kind === "pointerup")) return;
       if (kind === "pointerup" && travelled < 4) clicked([event.offsetX, event.offsetY]);
     });
   }

@@ -4,6 +4,7 @@ import { Camera } from "./camera.js";
 import { Chart, clock } from "./chart.js";
 import { colour, drawPlan, middle, robotColour, tinted } from "./draw.js";
 import { fillBars, nameOf, tellReasons } from "./hypotheses.js";
+import { Controls } from "./controls.js";
 import { makeLegend, markEmpty, visible } from "./layers.js";
 import { tellIncidents, tellNodes, tellRobots, tellTopics, text } from "./panels.js";
 import { listen } from "./pointer.js";
@@ -31,6 +32,7 @@ function redraw() {
 }
 
 const walls = new Walls(redraw);
+const controls = new Controls(camera, () => sceneOf(state.graph).areas);
 const chart = new Chart($("chart"), (reading) => text($("reading"), reading || "Probability over time; drag to zoom, double click for all"));
 
 // ---- which map is shown
@@ -63,6 +65,7 @@ function draw() {
   drawn.bars = $("bars").children.length;
   drawn.selected = other ? selected : null;
   drawn.past = past ? past.events - 1 : null;
+  controls.draw(plan);
   plan.dataset.drawn = JSON.stringify(drawn);
   const where = drawn.robot ? `, robot at ${$("position").textContent}` : "";
   plan.setAttribute("aria-label", `Map with ${drawn.areas} areas and ${drawn.arcs} arcs${where}`);
@@ -165,6 +168,8 @@ const shown = {
   alternatives: () => tellHypotheses(),
   events: (happened) => chart.show(events, happened),
   past: () => tellSlider(),
+  controls: (allowed) => controls.allow(allowed),
+  command: (outcome) => controls.tell(outcome),
   team: tellTeam,
   nodes: tellNodes,
   topics: tellTopics,
@@ -277,9 +282,10 @@ $("follow").addEventListener("click", () => {
 listen($("plan"), camera, {
   moved: () => choose("free"),
   zoomed: () => choose(mode === "follow" ? "follow" : "free"),
+  turned: redraw,
   wanted: choose,
   clicked: ask,
-});
+}, controls);
 makeLegend($("legend"), redraw);
 
 /** Say in words what is at a pixel: an area, or an arc. */
