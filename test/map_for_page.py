@@ -7,6 +7,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.alternatives import Alternative, AlternativeArea, Alternatives
 from hmt_slam_ros.messages.evidence import BranchStep, Evidence, HypothesisEvidence
 from hmt_slam_ros.messages.map_changes import ArcEnds
+from hmt_slam_ros.messages.statements import PlaceStatement, WeighedStatement
 from hmt_slam_ros.messages.topology import Topology, TopologyArc, TopologyArea, TopologyHypothesis
 
 SECOND = 1_000_000_000
@@ -48,8 +49,10 @@ def topology(count=6, keyframes=4, probability=0.9, events=None):
         TopologyHypothesis(OTHER, 1.0 - probability, count - 1),
     )
     events = count * keyframes if events is None else events
+    stated = PlaceStatement("same", 0, count - 1, "ann")
+    statements = (WeighedStatement(1, 20, stated, 0, keyframes * (count - 1), 0.97, "true"),)
     stamp = (1000 + events) * SECOND
-    return Topology(events, stamp, "map", hypotheses, 0.0, count - 1, local[-1], areas, tuple(arcs))
+    return Topology(events, stamp, "map", hypotheses, 0.0, count - 1, local[-1], areas, tuple(arcs), statements)
 
 
 def alternatives(count=6):

@@ -51,7 +51,7 @@ def topology(stamp=5, keyframes=1):
     known = PoseGaussian(np.array([1.0, 2.0, 0.5]), 0.01 * np.eye(3))
     poses, numbers = (np.zeros(3),) * keyframes, tuple(range(keyframes))
     area = TopologyArea(0, known, numbers, (5,) * keyframes, poses)
-    return Topology(1, stamp, "map", (TopologyHypothesis(0, 1.0, 0),), 0.0, 0, np.zeros(3), (area,), ())
+    return Topology(1, stamp, "map", (TopologyHypothesis(0, 1.0, 0),), 0.0, 0, np.zeros(3), (area,), (), ())
 
 
 def laser(angle=0.1, range_max=30.0, beams=3):

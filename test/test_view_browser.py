@@ -289,3 +289,61 @@ def test_the_chart_has_axes_and_says_what_is_under_the_pointer(map_page):
 
     page.until(lambda: "accepted" in reading())
     assert reading() == "0:12: #7 area 5 90.0 %, #12 area 5 10.0 % · closure of 2 with 0 accepted"
+
+
+TEXTS = ("ink", "soft", "good", "waiting", "attention", "fault", "area")
+SIGNS = ("wall", "path", "area", "here", "arc", "closure", "robot", "scan", "particle", "goal", "mark")
+
+
+def luminance(color):
+    """Relative luminance of "#rrggbb", by WCAG 2."""
+    channels = np.array([int(color[k : k + 2], 16) / 255.0 for k in (1, 3, 5)])
+    linear = np.where(channels <= 0.03928, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return float(linear @ (0.2126, 0.7152, 0.0722))
+
+
+def contrast(page, name, ground):
+    style = "getComputedStyle(document.documentElement).getPropertyValue('--{}').trim()"
+    shades = sorted(luminance(page.browser.evaluate(style.format(color))) for color in (name, ground))
+    return (shades[1] + 0.05) / (shades[0] + 0.05)
+
+
+@pytest.mark.parametrize("is_dark", [False, True], ids=["light", "dark"])
+def test_texts_and_signs_have_enough_contrast_on_their_grounds(map_page, is_dark, screenshots):
+    page = map_page
+    page.browser.dark(is_dark)
+    try:
+        low = {(name, ground) for name in TEXTS for ground in ("card", "ground") if contrast(page, name, ground) < 4.5}
+        low |= {
+            (name, ground) for name in SIGNS for ground in ("free", "unknown") if contrast(page, name, ground) < 3.0
+        }
+        assert low == set()
+        press(page, OTHER)
+        page.until(lambda: page.drawing["walls"] == 24)
+        page.browser.screenshot(screenshots / f"other_hypothesis_{'dark' if is_dark else 'light'}.png")
+    finally:
+        page.browser.dark(False)
+
+
+def test_on_a_phone_everything_is_in_one_column_and_can_be_pressed(map_page, screenshots):
+    page = map_page
+    page.board.put("controls", True)
+    page.browser.open("about:blank")
+    page.browser.size(390, 844, mobile=True, ratio=2.0)
+    try:
+        page.browser.open(f"{page.url}#token={page.commands.token}")
+        page.until(lambda: page.drawing.get("areas") == 6 and is_shown(page, "goal") and page.drawing["bars"] == 2)
+        assert page.browser.evaluate("document.documentElement.scrollWidth - window.innerWidth") == 0
+        small = page.browser.evaluate(
+            "[...document.querySelectorAll('button, summary, input[type=range]')]"
+            ".filter((one) => one.offsetParent && one.getBoundingClientRect().height < 28)"
+            ".map((one) => one.id || one.className)"
+        )
+        assert small == []
+        page.browser.screenshot(screenshots / "phone_hypotheses.png", whole=True)
+    finally:
+        page.board.put("controls", False)
+        page.browser.size(1280, 800)
+        page.browser.open("about:blank")
+        page.browser.open(page.url)
+        page.until(lambda: page.drawing.get("areas") == 6)

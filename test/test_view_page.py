@@ -3,6 +3,7 @@
 import http.client
 import io
 import json
+import re
 import socket
 from dataclasses import replace
 from urllib.error import HTTPError
@@ -19,7 +20,7 @@ from hmt_slam_ros.messages.messages import Hypotheses, Hypothesis, Keyframe
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.view.board import HISTORY_LENGTH, Board, ClientState, KeyframeHistory
 from hmt_slam_ros.view.health import SystemHealth
-from hmt_slam_ros.view.server import PORT, PageServer, grid_png
+from hmt_slam_ros.view.server import PAGE, PORT, PageServer, grid_png
 
 NODES = ("slam", "rtl")
 
@@ -117,20 +118,27 @@ def test_events_are_reported_once_in_order_when_both_halves_are_there_and_a_new_
 
 
 def test_the_page_its_style_and_its_scripts_are_served_and_request_nothing_from_elsewhere(server):
-    for path, kind in (
-        ("", "text/html"),
-        ("view.css", "text/css"),
-        ("view.js", "text/javascript"),
-        ("draw.js", "text/javascript"),
-    ):
+    kinds = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".txt": "text/plain"}
+    files = {path.name: kinds[path.suffix] for path in PAGE.iterdir()}
+    del files["index.html"]
+    assert {"view.css", "view.js", "uplot.js", "uplot.css", "uplot.license.txt"} <= files.keys()
+    for path, kind in [("", "text/html"), *files.items()]:
         with urlopen(server.url + path, timeout=10) as answer:
             assert answer.headers["Content-Type"].startswith(kind)
             assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
-            text = answer.read().decode()
+            # The name of the chart library has its address in the comment at its top.
+            text = answer.read().decode().removeprefix("/*! https://github.com/leeoniya/uPlot (v1.6.32) */")
             assert "http:" not in text
             assert "https:" not in text
     assert status_of(server.url + "../server.py") == 404
     assert status_of(server.url + "board.py") == 404
+
+
+def test_the_page_has_no_nats():
+    texts = {path.name: path.read_text() for path in PAGE.iterdir() if path.name != "uplot.js"}
+    assert [name for name, text in texts.items() if re.search(r"\bnats?\b", text)] == []
+    node = (PAGE.parents[1] / "ros" / "publishing_nodes.py").read_text()
+    assert not re.search(r"\bnats\b", node)
 
 
 def test_the_map_is_sent_to_those_who_do_not_have_it(board, server):

@@ -24,6 +24,12 @@ _MAX_ARCS = 20_000
 _MAX_KEYFRAMES = 50_000
 """Keyframes of a map that is shown."""
 
+_MAX_STATEMENTS = 20
+"""Statements of people that are shown, the newest."""
+
+_MAX_STATEMENT = 300
+"""Characters of a statement."""
+
 _UNKNOWN_PLACE = "It is not known where this is in the map."
 
 _TITLES = {
@@ -58,6 +64,9 @@ def topology_section(topology: Topology) -> dict[str, Any]:
         "hypotheses": [[h.hypothesis, round(h.probability, 5), h.area] for h in topology.hypotheses],
         "area": topology.area,
         "robot": _round_pose(topology.pose),
+        "statements": [
+            [str(one)[:_MAX_STATEMENT], round(one.probability, 4)] for one in topology.statements[-_MAX_STATEMENTS:]
+        ],
         "areas": [_area(area) for area in topology.areas],
         "arcs": [_arc(arc, poses[arc.source]) for arc in topology.arcs if arc.source in poses and arc.target in poses],
     }

@@ -61,6 +61,11 @@ export function tellReasons(box, hypothesis, event, evidence, alternative) {
   box.replaceChildren(title, list);
 }
 
+/** List what people stated about places, each with the probability that it is true. */
+export function tellStatements(list, statements) {
+  list.replaceChildren(...(statements ?? []).map(([text, probability]) => line("", `${text}: ${percent(probability)}`)));
+}
+
 function stepRow({ title, probability, pro, con }) {
   const row = line("step", `${title}, ${percent(probability)} then`);
   const list = row.appendChild(document.createElement("ul"));

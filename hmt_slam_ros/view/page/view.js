@@ -3,7 +3,7 @@
 import { Camera } from "./camera.js";
 import { Chart, clock } from "./chart.js";
 import { colour, drawPlan, middle, robotColour, tinted } from "./draw.js";
-import { fillBars, nameOf, tellReasons } from "./hypotheses.js";
+import { fillBars, nameOf, tellReasons, tellStatements } from "./hypotheses.js";
 import { Controls } from "./controls.js";
 import { makeLegend, markEmpty, visible } from "./layers.js";
 import { tellIncidents, tellNodes, tellRobots, tellTopics, text } from "./panels.js";
@@ -164,6 +164,7 @@ const shown = {
     chart.show(events, state.events ?? []);
     tellSlider();
   },
+  graph: ({ statements }) => tellStatements($("statements"), statements),
   evidence: () => tellHypotheses(),
   alternatives: () => tellHypotheses(),
   events: (happened) => chart.show(events, happened),
