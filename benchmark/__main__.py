@@ -68,6 +68,7 @@ MEASUREMENTS = {
     "laps": "memory, cost and errors over repeated laps on known ground",
     "changes": "maps of changing worlds in mode lifelong, among people",
     "scale": "time and memory in maps of up to 100,000 areas",
+    "page": "share of a core that the live page takes with a map of 200 areas",
     "kernels": "CPU time and memory allocations of the inner loops",
     "soak": "memory of nodes that run for an hour, and what they leave behind",
     "structure": "how large the package is, and how many files one scan, one keyframe and one closure pass",

@@ -118,7 +118,7 @@ def time_until_answer(name: str) -> StartTime:
                 listener.spin_once()
                 if time.monotonic() > again:
                     requests, again = [*requests, client.call_async(ListParameters.Request())], again + _LOST
-            return StartTime(time.monotonic() - begin, _cpu_seconds(process))
+            return StartTime(time.monotonic() - begin, cpu_seconds(process))
 
 
 def time_until_first_pose() -> StartTime:
@@ -132,7 +132,7 @@ def time_until_first_pose() -> StartTime:
             begin = time.monotonic()
             with listener.running("slam", {"laser_pose": log.scans[0].laser_pose.tolist()}) as process:
                 listener.wait_until(lambda: bool(estimates))
-                return StartTime(time.monotonic() - begin, _cpu_seconds(process))
+                return StartTime(time.monotonic() - begin, cpu_seconds(process))
 
 
 def _waiting_robot(log: Path) -> Parameters:
@@ -140,7 +140,7 @@ def _waiting_robot(log: Path) -> Parameters:
     return {"log": str(log), "robot.discovery_timeout": 3600.0, "robot.rate": 0.0}
 
 
-def _cpu_seconds(process: subprocess.Popen[bytes]) -> float:
+def cpu_seconds(process: subprocess.Popen[bytes]) -> float:
     """User and system time up to now."""
     line = Path(f"/proc/{process.pid}/stat").read_text(encoding="utf-8")
     # Fields 14 and 15; the second, in parentheses, may hold spaces.

@@ -28,8 +28,8 @@ from hmt_slam_ros.untrusted_input import shorten
 from hmt_slam_ros.view.board import Board
 from hmt_slam_ros.view.map_sections import LaserBeams, MapSections
 
-_MAX_SHARE = 0.03
-"""Share of a core that the documents of the map take at most: the larger a map, the less often it is shown."""
+_MAX_SHARE = 0.02
+"""Share of a core that the documents of a topic take at most: the larger a map, the less often it is shown."""
 
 _PERIOD = 0.9
 """Least time between two documents of the map that are shown, s."""
@@ -53,6 +53,41 @@ class _Layer(NamedTuple):
     profile: Any
 
 
+class MapDocuments:
+    """The documents of one topic of the map, of which the newest is shown within a share of a core."""
+
+    def __init__(self, kind: type[Any], show: Callable[[Any], None], diagnostics: NodeDiagnostics) -> None:
+        self._kind, self._show, self._diagnostics = kind, show, diagnostics
+        self._newest: String | None = None
+        self._next_at = 0.0
+
+    def keep(self, message: String) -> None:
+        """Keep a message until it is shown, or a newer one comes."""
+        self._newest = message
+
+    def show_if_due(self, *, is_watched: bool) -> None:
+        """Show the newest message, where it is time; one that cannot be shown is refused.
+
+        :param is_watched: whether a browser shows the page.
+        """
+        now = time.monotonic()
+        if self._newest is None or now < self._next_at:
+            return
+        message, self._newest = self._newest, None
+        begin = time.thread_time()
+        try:
+            document, _ = decode_checked(message.data, self._kind, self._diagnostics.system)
+            self._show(document)
+        except HmtSlamError as fault:
+            self._diagnostics.refuse(DOCUMENTS[self._kind], fault)
+        period = _PERIOD if is_watched else _UNWATCHED_PERIOD
+        self._next_at = now + max(period, (time.thread_time() - begin) / _MAX_SHARE)
+
+    def hurry(self) -> None:
+        """Show the next message at once, since somebody looks now."""
+        self._next_at = 0.0
+
+
 class MapLayers:
     """Shows the map of every hypothesis and the layers above it.
 
@@ -68,17 +103,16 @@ class MapLayers:
     ) -> None:
         self.sections = MapSections(board)
         self._board, self._subscribe, self._unsubscribe, self._diagnostics = board, subscribe, unsubscribe, diagnostics
-        self._newest_topology: String | None = None
-        self._next_at = 0.0
+        self._topologies = MapDocuments(Topology, self.sections.add_topology, diagnostics)
+        self._alternatives = MapDocuments(Alternatives, self.sections.add_alternatives, diagnostics)
         self._watched: list[Any] = []
-        subscribe(String, DOCUMENTS[Topology], self._keep_topology, topics.LATCHED)
+        subscribe(String, DOCUMENTS[Topology], self._topologies.keep, topics.LATCHED)
         on_evidence = document_callback(diagnostics, Evidence, self.sections.add_evidence)
         subscribe(String, DOCUMENTS[Evidence], on_evidence, topics.LATCHED)
         subscribe(LaserScan, KEYFRAME_SCANS, self._on_keyframe_scan, topics.CHAIN_HISTORY)
         on_place = document_callback(diagnostics, PlaceEstimate, self._on_place)
-        on_alternatives = document_callback(diagnostics, Alternatives, self.sections.add_alternatives)
         self._layers = (
-            _Layer(String, DOCUMENTS[Alternatives], on_alternatives, topics.LATCHED),
+            _Layer(String, DOCUMENTS[Alternatives], self._alternatives.keep, topics.LATCHED),
             _Layer(LaserScan, SCAN, self._on_scan, topics.NEWEST),
             _Layer(PoseArray, PARTICLES, self._on_particles, topics.NEWEST),
             _Layer(PoseStamped, GOAL_POSE, lambda m: board.put("goal", planar_pose(m.pose)), topics.NEWEST),
@@ -88,28 +122,16 @@ class MapLayers:
 
     def update(self) -> None:
         """Show the newest map, where it is time; subscribe to the layers while a browser shows the page."""
-        now, watched = time.monotonic(), self._board.is_watched
+        watched = self._board.is_watched
         if watched and not self._watched:
             self._watched = [self._subscribe(*layer) for layer in self._layers]
-            self._next_at = 0.0
+            self._topologies.hurry()
         elif not watched and self._watched:
             for subscription in self._watched:
                 self._unsubscribe(subscription)
             self._watched = []
-        if self._newest_topology is None or now < self._next_at:
-            return
-        message, self._newest_topology = self._newest_topology, None
-        begin = time.thread_time()
-        try:
-            topology, _ = decode_checked(message.data, Topology, self._diagnostics.system)
-            self.sections.add_topology(topology)
-        except HmtSlamError as fault:
-            self._diagnostics.refuse(DOCUMENTS[Topology], fault)
-        period = _PERIOD if watched else _UNWATCHED_PERIOD
-        self._next_at = now + max(period, (time.thread_time() - begin) / _MAX_SHARE)
-
-    def _keep_topology(self, message: String) -> None:
-        self._newest_topology = message
+        for documents in (self._topologies, self._alternatives):
+            documents.show_if_due(is_watched=watched)
 
     def _on_keyframe_scan(self, message: LaserScan) -> None:
         keyframe, _, system = keyframe_from_frame(message.header.frame_id)
