@@ -238,3 +238,11 @@ def test_foxglove_shows_the_topics_the_nodes_publish():
     assert plotted == {"/hmt/pmf", "/hmt/entropy", "/hmt/is_localized"}
     reported = {panels["DiagnosticSummary!nodes"]["topicToRender"], plan["publish"]["poseEstimateTopic"]}
     assert plotted | set(plan["topics"]) | reported <= topics_of_the_nodes()
+
+
+def test_the_package_has_every_file_of_the_page(setup_arguments):
+    package = ROOT / "hmt_slam_ros"
+    shipped = {path for pattern in setup_arguments["package_data"]["hmt_slam_ros"] for path in package.glob(pattern)}
+    files = {path for path in (package / "view" / "page").rglob("*") if path.is_file()}
+    assert {"uplot.js", "uplot.css", "uplot.license.txt", "index.html"} <= {path.name for path in files}
+    assert files <= shipped

@@ -36,7 +36,18 @@ SOMETIMES = {
     "/ground_truth": "from a simulated log",
     "/cmd_vel": "with robot.drive: commands",
     "/marks": "with marks.topic",
-    "/map": "while the live page is open",
+    **dict.fromkeys(
+        (
+            "/map",
+            "/hmt/alternatives",
+            "/hmt/particles",
+            "/hmt/ambiguity_goal",
+            "/pilot/place_estimate",
+            "/scan",
+            "/goal_pose",
+        ),
+        "while the live page is open",
+    ),
     "/pose": "goes with hmt/pose",
 }
 """{topic: when a node that may use it does}."""

@@ -84,7 +84,7 @@ class MapDocuments:
         self._next_at = now + max(period, (time.thread_time() - begin) / _MAX_SHARE)
 
     def hurry(self) -> None:
-        """Show the next message at once, since somebody looks now."""
+        """Show the next message at once, since a page was opened."""
         self._next_at = 0.0
 
 

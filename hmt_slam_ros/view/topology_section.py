@@ -55,7 +55,7 @@ def topology_section(topology: Topology) -> dict[str, Any]:
             "publishes it"
         )
     if topology.stamp > MAX_STAMP:
-        raise HmtSlamError(f"stamp = {shorten(topology.stamp)} is none of a keyframe: look who publishes the map")
+        raise HmtSlamError(f"stamp = {shorten(topology.stamp)} is none of a keyframe: look who publishes it")
     poses = {area.area: area.pose for area in topology.areas}
     return {
         "events": topology.events,

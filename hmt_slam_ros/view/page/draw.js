@@ -81,7 +81,7 @@ export function drawPlan(canvas, camera, state, { scene, picture, walls, team, p
   }
   drawn.walls = visible.walls && walls ? walls.draw(context, camera, scene, themed("--wall")) : 0;
   drawn.team = team.map((other) => drawOther(context, camera, other));
-  drawn.path = visible.path ? drawPath(context, camera, scene.path, paint ?? themed("--path")) : 0;
+  drawn.path = visible.path ? drawPath(context, camera, scene.path, paint) : 0;
   drawGraph(context, camera, scene, paint, visible, drawn);
   drawLayers(context, camera, state, scene, robot, visible, drawn);
   drawn.others = visible.others ? others.length : 0;
@@ -199,8 +199,6 @@ function drawOther(context, camera, { name, frame, map, robot, paint, picture })
 }
 
 function drawPath(context, camera, path, paint) {
-  context.strokeStyle = paint;
-  context.lineWidth = 1.5;
   context.lineJoin = "round";
   context.beginPath();
   path.forEach((point, k) => {
@@ -209,6 +207,14 @@ function drawPath(context, camera, path, paint) {
     if (jump) context.moveTo(u, v);
     else context.lineTo(u, v);
   });
+  if (paint) {
+    // In the colour of a hypothesis, which may be as dark as the ground.
+    [context.strokeStyle, context.lineWidth] = [themed("--ink"), 4];
+    context.globalAlpha = 0.45;
+    context.stroke();
+    context.globalAlpha = 1;
+  }
+  [context.strokeStyle, context.lineWidth] = [paint ?? themed("--path"), paint ? 2 : 1.5];
   context.stroke();
   return path.length;
 }
