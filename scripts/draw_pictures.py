@@ -2,8 +2,8 @@
 """Draw the pictures of README.md and docs/guides/tutorial.md from runs, and reduce all files in docs/images.
 
 malaga_map.png is the map of the bundled log, twins_pmf.png the probabilities of a simulated drive through two identical
-rooms. worlds.png, view.png and concept_*.svg have separate scripts, which this one runs. view.png needs a browser: the
-old picture stays without one.
+rooms. worlds.png, view.png, closure.webp and concept_*.svg have separate scripts, which this one runs. view.png and
+closure.webp need a browser: the old ones stay without one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PICTURES = {
     "malaga_map.png": ("data/malaga_one_loop", "map.png", 700),
     "twins_pmf.png": ("sim:twins,seed=1", "pmf.png", 900),
 }
-OTHERS = ("draw_worlds.py", "draw_view.py", "draw_concepts.py")
+OTHERS = ("draw_worlds.py", "draw_view.py", "draw_closure.py", "draw_concepts.py")
 COLORS = 128
 
 

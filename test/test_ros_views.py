@@ -25,7 +25,9 @@ from visualization_msgs.msg import MarkerArray
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
-from hmt_slam_ros.messages.documents import encode
+from hmt_slam_ros.messages.alternatives import Alternatives
+from hmt_slam_ros.messages.documents import decode, encode
+from hmt_slam_ros.messages.evidence import Evidence
 from hmt_slam_ros.messages.map_changes import Arc, AreaPose
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, HypothesisEstimate, Keyframe
 from hmt_slam_ros.messages.team import TeamPlacement, Verdict
@@ -89,6 +91,8 @@ def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(li
     poses = listener.subscribe(PoseWithCovarianceStamped, POSE, ALL)
     local_poses = listener.subscribe(PoseWithCovarianceStamped, HMT_POSE, ALL)
     pmfs = listener.subscribe(Float64MultiArray, PMF, topics.LATCHED)
+    evidences = listener.subscribe(String, DOCUMENTS[Evidence], topics.CHAIN_HISTORY)
+    alternatives = listener.subscribe(String, DOCUMENTS[Alternatives], topics.CHAIN_HISTORY)
     health = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     transforms = listener.subscribe(TFMessage, "tf", ALL) if TFMessage else None
     finished = listener.subscribe(String, FINISHED, topics.CHAIN)
@@ -115,6 +119,8 @@ def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(li
     assert {"area_0", "area_1", "area_2"} <= {message.header.frame_id for message in local_poses}
     assert min(len(poses), len(local_poses)) > 100
     assert_health(health)
+    assert_evidence(evidences)
+    assert {decode(message.data, Alternatives).best for message in alternatives}
     if transforms is not None:
         pairs = {(t.header.frame_id, t.child_frame_id) for message in transforms for t in message.transforms}
         assert ("map", "odom") in pairs
@@ -127,14 +133,22 @@ def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(li
     page.until(lambda: page.drawing["areas"] == groups_of(graphs[-1])["areas"])
     assert_page(page, port, graphs[-1], pmfs[-1])
     assert page.drawing["robot"] != early
-    browser.screenshot(screenshots / "desktop.png")
-    assert_that_it_answers_clicks(page, snapshot(port)["graph"])
-    browser.dark(True)
-    listener.spin(0.5)
-    browser.screenshot(screenshots / "dark.png")
-    browser.dark(False)
-    assert_phone(page, screenshots)
+    assert_screens(page, port, screenshots)
     assert browser.complaints == []
+
+
+def assert_screens(page, port, screenshots):
+    """The page at the end of the run on a desk, in the dark and on a phone."""
+    drawn, known = page.drawing, snapshot(port)
+    assert min(drawn["path"], drawn["scan"]) > 50
+    assert sum(event["kind"] == "accepted" for event in known["events"]) == drawn["closures"]
+    page.browser.screenshot(screenshots / "desktop.png")
+    assert_that_it_answers_clicks(page, known["graph"])
+    page.browser.dark(True)
+    page.until(lambda: page.browser.evaluate("matchMedia('(prefers-color-scheme: dark)').matches"))
+    page.browser.screenshot(screenshots / "dark.png")
+    page.browser.dark(False)
+    assert_phone(page, screenshots)
 
 
 def assert_map(grid):
@@ -168,6 +182,14 @@ def assert_health(health):
     assert float(reported["slam"]["memory"].removesuffix(" MB")) > 20.0
     values = [value for array in health for status in array.status for value in status.values]
     assert max(float(value.value) for value in values if value.key == "sent Scan a second") > 1.0
+
+
+def assert_evidence(evidences):
+    """Why the loop was closed, until it was accepted."""
+    known = [decode(message.data, Evidence) for message in evidences]
+    steps = [step for one in known for hypothesis in one.hypotheses for step in hypothesis.steps]
+    assert any(step.kind == "closure" and step.matched > step.contradicting for step in steps)
+    assert known[-1].hypotheses == ()
 
 
 def open_before_anything_runs(page, port):

@@ -37,9 +37,10 @@ const chart = new Chart($("chart"), (reading) => text($("reading"), reading || "
 
 // ---- which map is shown
 
-/** The map of the selected hypothesis where it is not the most probable one. */
+/** The map of the selected hypothesis where it is not the most probable one, against whose map it is a change. */
 function alternative() {
-  return past ? null : state.alternatives?.hypotheses[selected] ?? null;
+  if (past || state.alternatives?.best !== state.graph?.best) return null;
+  return state.alternatives?.hypotheses[selected] ?? null;
 }
 
 function shownEvent() {
@@ -77,7 +78,8 @@ function draw() {
 /** Where the robot is under the other hypotheses. */
 function otherPoses() {
   const names = new Map((events.at(-1)?.hypotheses ?? []).map((leaf) => [String(leaf[0]), leaf]));
-  return Object.entries(state.alternatives?.hypotheses ?? {}).flatMap(([number, one]) => {
+  const others = state.alternatives?.best === state.graph?.best ? state.alternatives?.hypotheses : {};
+  return Object.entries(others ?? {}).flatMap(([number, one]) => {
     const area = one.areas.find((each) => each.area === one.area);
     if (!area || !names.has(number) || names.get(number)[3]) return [];
     return [{ pose: compose(area.pose, one.robot), paint: colour(Number(number)), name: `#${number}` }];
