@@ -272,6 +272,10 @@ def test_layers_are_hidden_and_shown(map_page):
         page.until(lambda name=name, count=count: page.drawing[name] < count)
         page.browser.evaluate(f"{box}.click()")
         page.until(lambda name=name, count=count: page.drawing[name] == count)
+    page.board.put("look", [5.0, 5.0, 0.0])
+    page.until(lambda: page.drawing["goals"] == 2)
+    page.board.append_event({**history(25)[-1], "live": 1})
+    page.until(lambda: page.drawing["goals"] == 1)
     legend = page.browser.evaluate("document.getElementById('legend').textContent")
     for title in ("Scan", "Particles", "Goals", "Marks", "Path, corrected"):
         assert title in legend

@@ -162,6 +162,7 @@ const shown = {
   history: ({ anew, events: more }) => {
     if (anew) showPast(null);
     events = [...(anew ? [] : events), ...more].slice(-MOST_EVENTS);
+    if (events.at(-1)?.live === 1) state.look = null; // nothing is open any more
     tellHypotheses();
     chart.show(events, state.events ?? []);
     tellSlider();
