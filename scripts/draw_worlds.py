@@ -22,9 +22,9 @@ SEED = 1
 def main() -> None:
     """Draw one building of every family."""
     figure, axes = plt.subplots(2, (len(FAMILIES) + 1) // 2, figsize=(12.0, 6.5), layout="constrained")
-    for axis in axes.is_flat:
+    for axis in axes.flat:
         axis.set_axis_off()
-    for axis, name in zip(axes.is_flat, FAMILIES, strict=False):
+    for axis, name in zip(axes.flat, FAMILIES, strict=False):
         scenario = open_simulated(f"sim:{name},seed={SEED}").scenario
         walls = np.concatenate((scenario.building.walls, furniture_walls(scenario.building.furniture)))
         axis.add_collection(LineCollection(walls.reshape(-1, 2, 2).tolist(), colors="black", linewidths=0.8))
