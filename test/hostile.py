@@ -47,7 +47,6 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
-from visualization_msgs.msg import Marker, MarkerArray
 
 from hmt_slam_ros.messages.messages import Hypotheses
 from hmt_slam_ros.process_table import process_names
@@ -71,7 +70,7 @@ PAUSE = 0.01
 """Time between two messages, s, in which the nodes' own messages come between."""
 LONG_PAUSE = 0.25
 """The same after a message of which the page takes the newest alone, five times a second, s."""
-NEWEST_ALONE = ("/map", "/pose", "/hmt/graph")
+NEWEST_ALONE = ("/map", "/pose")
 ANSWER_TIMEOUT = 60.0  # s
 ATTACK_RATE = 0.2
 """Rate of the robot while it speaks, so that its log lasts as long."""
@@ -161,7 +160,6 @@ class Stranger:
             "/scan": lambda: bad_scans(lambda: self.newest),
             "/odom": lambda: bad_readings(lambda: self.newest),
             DIAGNOSTICS: lambda: diagnostics(self.system),
-            "/hmt/graph": lambda: (MarkerArray(markers=[marker]) for marker in extreme_messages(Marker)),
             "/initialpose": initial_poses,
             "/hmt/keyframe_scans": lambda: keyframe_scans(lambda: self.newest, self.system),
         }
