@@ -13,6 +13,7 @@ import pytest
 from hmt_slam_ros.view import server as server_module
 from hmt_slam_ros.view.board import Board
 from hmt_slam_ros.view.connections import MAX_CONNECTIONS
+from hmt_slam_ros.view.request_handler import PageHandler
 from hmt_slam_ros.view.server import PageServer, grid_png
 
 
@@ -95,8 +96,8 @@ def test_a_thousand_idle_connections_lock_nobody_out_and_take_few_threads(serve,
 
 
 def test_a_connection_without_a_request_is_closed_after_a_while(serve, connect, monkeypatch):
-    assert server_module._Handler.timeout == 10.0
-    monkeypatch.setattr(server_module._Handler, "timeout", 0.2)
+    assert PageHandler.timeout == 10.0
+    monkeypatch.setattr(PageHandler, "timeout", 0.2)
     connection = connect(serve(), b"GET /snapshot.json HTTP/1.1\r\n")
     assert connection.recv(100) == b""
 
@@ -124,7 +125,7 @@ def test_streams_that_nobody_reads_lock_nobody_out(serve, connect):
 
 
 def test_a_stream_that_is_not_read_is_dropped(serve, connect, board, monkeypatch):
-    monkeypatch.setattr(server_module._Handler, "timeout", 0.5)
+    monkeypatch.setattr(PageHandler, "timeout", 0.5)
     port = serve()
     connect(port, b"GET /news HTTP/1.1\r\nHost: localhost\r\n\r\n").recv(1)
     assert serve.servers[0].connection_count == 1

@@ -20,7 +20,8 @@ from hmt_slam_ros.messages.messages import Hypotheses, Hypothesis, Keyframe
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.view.board import HISTORY_LENGTH, Board, ClientState, KeyframeHistory
 from hmt_slam_ros.view.health import SystemHealth
-from hmt_slam_ros.view.server import PAGE, PORT, PageServer, grid_png
+from hmt_slam_ros.view.request_handler import PAGE
+from hmt_slam_ros.view.server import PORT, PageServer, grid_png
 
 NODES = ("slam", "rtl")
 
