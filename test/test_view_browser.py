@@ -169,7 +169,7 @@ def test_a_selected_hypothesis_shows_its_map_its_pose_and_what_speaks_for_and_ag
     assert lines_of(map_page, "reasons") == [
         "Area 5 #12 now 10.0 %",
         "is on new ground, area 5, 40.0 % then",
-        "has no arc between 0 and 5, as the most probable one has",
+        "does not close 0 with 5, as the most probable one does",
     ]
     map_page.browser.screenshot(screenshots / "other_hypothesis.png")
     map_page.board.append_event({**history(25)[-1], "hypotheses": [[BEST, 5, 1.0, False]], "live": 1})
@@ -253,6 +253,9 @@ def test_the_path_and_the_past_are_whole_after_a_reload(map_page, screenshots):
     assert page.text("when") == "0:08 of 0:16"
     assert page.text("banner") == "Map of the past"
     page.browser.screenshot(screenshots / "past.png")
+    page.board.put("past", [*page.board.past.index(), [24, 1025.0]])  # the run goes on
+    page.until(lambda: page.text("when") == "0:08 of 0:17")
+    assert page.browser.evaluate("document.getElementById('time').value") == "1"
     page.browser.evaluate("document.getElementById('now').click()")
     page.until(lambda: page.drawing["past"] is None and page.drawing["path"] == 24)
 

@@ -43,8 +43,11 @@ function bar(name, number, probability, paint, kind) {
   return row;
 }
 
-/** Say what speaks for and against a hypothesis, from the sections "evidence" and "alternatives". */
-export function tellReasons(box, hypothesis, event, evidence, alternative) {
+/**
+ * Say what speaks for and against a hypothesis, from the section "evidence".
+ * Closures that the most probable one has and it lacks are pairs of areas.
+ */
+export function tellReasons(box, hypothesis, event, evidence, lacking) {
   const leaf = event?.hypotheses.find(([number]) => number === hypothesis);
   box.hidden = !leaf || (event.hypotheses.length === 1 && !evidence?.[hypothesis]);
   if (box.hidden) {
@@ -54,7 +57,7 @@ export function tellReasons(box, hypothesis, event, evidence, alternative) {
   const title = document.createElement("p");
   title.append(strong(nameOf(leaf), colour(hypothesis)), ` now ${percent(leaf[2])}`);
   const rows = (evidence?.[hypothesis] ?? []).map(stepRow);
-  const missing = (alternative?.missing ?? []).map(([a, b]) => line("con", `has no arc between ${a} and ${b}, as the most probable one has`));
+  const missing = lacking.map(([a, b]) => line("con", `does not close ${a} with ${b}, as the most probable one does`));
   const nothing = rows.length + missing.length ? [] : [line("", "All hypotheses agree so far on what this one says.")];
   const list = document.createElement("ul");
   list.append(...rows, ...missing, ...nothing);

@@ -11,6 +11,7 @@ import { listen } from "./pointer.js";
 import { compose, sceneOf, Walls } from "./scene.js";
 
 const MOST_EVENTS = 1000;
+const MARGIN = 3; // m around areas and path where no picture says how far the walls are
 const $ = (name) => document.getElementById(name);
 const state = {};
 const camera = new Camera();
@@ -99,7 +100,8 @@ function fit(scene) {
   for (const point of points) {
     for (const k of [0, 1]) [low[k], high[k]] = [Math.min(low[k], point[k]), Math.max(high[k], point[k])];
   }
-  camera.fit(low, high.map((end, k) => end - low[k]));
+  const margin = grid ? 0 : MARGIN;
+  camera.fit(low.map((start) => start - margin), high.map((end, k) => end - low[k] + 2 * margin));
 }
 
 /** Where another robot's map and the robot are in this map. */
@@ -207,11 +209,17 @@ function tellHypotheses() {
   text($("live"), event ? `${event.live} live after ${event.path_length.toFixed(0)} m` : "");
   const best = event?.hypotheses[0]?.[0] ?? null;
   fillBars($("bars"), event, selected ?? best, select);
-  tellReasons($("reasons"), selected ?? best, event, past ? null : state.evidence, alternative());
+  tellReasons($("reasons"), selected ?? best, event, past ? null : state.evidence, lackingClosures());
   const leaf = event?.hypotheses.find(([hypothesis]) => hypothesis === selected);
   const which = alternative() && leaf ? `Map under hypothesis ${nameOf(leaf)}` : "";
   const when = past ? "Map of the past" : "";
   text($("banner"), which || when);
+}
+
+/** The closures of the most probable hypothesis that the selected one lacks, as pairs of areas. */
+function lackingClosures() {
+  const closures = new Set((state.graph?.arcs ?? []).filter(({ closure }) => closure).map(({ ends }) => String(ends)));
+  return (alternative()?.missing ?? []).filter((ends) => closures.has(String(ends)));
 }
 
 /** Draw the robots of the team that are joined, and list all. */
@@ -253,21 +261,22 @@ function tellSlider() {
   const times = state.past ?? [];
   const slider = $("time");
   slider.max = times.length;
-  if (!past) slider.value = times.length;
+  const at = wanted === null ? -1 : times.findLastIndex(([event]) => event <= wanted);
+  slider.value = at < 0 ? times.length : at;
   slider.disabled = times.length === 0;
   const first = times[0]?.[1];
-  const at = times[Number(slider.value)];
-  text($("when"), past && at ? `${clock(at[1] - first)} of ${clock(times.at(-1)[1] - first)}` : "now");
+  text($("when"), at < 0 ? "now" : `${clock(times[at][1] - first)} of ${clock(times.at(-1)[1] - first)}`);
 }
 
 async function showPast(event) {
   wanted = event;
   const answer = event === null ? null : await fetch(`past.json?event=${event}`);
-  if (wanted !== event || (answer && !answer.ok)) return;
-  past = answer && await answer.json();
+  if (wanted !== event) return;
+  past = answer?.ok ? await answer.json() : null;
+  if (!past) wanted = null;
   if (past) selected = null;
   hint = "";
-  chart.mark(event);
+  chart.mark(wanted);
   tellSlider();
   tellHypotheses();
   redraw();
