@@ -65,12 +65,12 @@ class MapDocuments:
         """Keep a message until it is shown, or a newer one comes."""
         self._newest = message
 
-    def show_if_due(self, *, is_watched: bool) -> None:
+    def show_if_due(self, now: float, *, is_watched: bool) -> None:
         """Show the newest message, where it is time; one that cannot be shown is refused.
 
+        :param now: time on the clock of the node, s.
         :param is_watched: whether a browser shows the page.
         """
-        now = time.monotonic()
         if self._newest is None or now < self._next_at:
             return
         message, self._newest = self._newest, None
@@ -120,8 +120,11 @@ class MapLayers:
             _Layer(String, DOCUMENTS[PlaceEstimate], on_place, topics.LATCHED),
         )
 
-    def update(self) -> None:
-        """Show the newest map, where it is time; subscribe to the layers while a browser shows the page."""
+    def update(self, now: float) -> None:
+        """Show the newest map, where it is time; subscribe to the layers while a browser shows the page.
+
+        :param now: time on the clock of the node, which a recording has too, s.
+        """
         watched = self._board.is_watched
         if watched and not self._watched:
             self._watched = [self._subscribe(*layer) for layer in self._layers]
@@ -131,7 +134,7 @@ class MapLayers:
                 self._unsubscribe(subscription)
             self._watched = []
         for documents in (self._topologies, self._alternatives):
-            documents.show_if_due(is_watched=watched)
+            documents.show_if_due(now, is_watched=watched)
 
     def _on_keyframe_scan(self, message: LaserScan) -> None:
         keyframe, _, system = keyframe_from_frame(message.header.frame_id)

@@ -191,9 +191,7 @@ class ViewNode(GuardedNode):
                 self._listening_time, last = self._listening_time + min(now - last, _LONGEST_STEP), now
                 self._spin_pending(executor)
                 self._history.publish_complete()
-                self._layers.update()
-                self._controls.update()
-                self.board.put("events", self._events.rows())
+                self._update_layers()
                 self._publish_health()
                 self._update_map_subscription()
                 self._team.update()
@@ -208,6 +206,12 @@ class ViewNode(GuardedNode):
             idle = idle + 1 if self._message_count == before else 0
             if idle == _IDLE_TURNS:
                 return
+
+    def _update_layers(self) -> None:
+        """Show the map as data with its layers and events, and execute commands."""
+        self._layers.update(self._listening_time)
+        self._controls.update()
+        self.board.put("events", self._events.rows())
 
     def _update_map_subscription(self) -> None:
         """Subscribe to the map while a browser shows the page, since tlca renders it only for subscribers."""
