@@ -17,6 +17,9 @@ from hmt_slam_ros.untrusted_input import open_regular, read_file
 _MCAP, _SQLITE, _GZIP, _XZ = b"\x89MCAP0\r\n", b"SQLite format 3\x00", b"\x1f\x8b", b"\xfd7zXZ\x00"
 """First bytes of files."""
 
+_BAGS = {_MCAP: ".mcap", _SQLITE: ".db3"}
+"""{first bytes of a bag's file: its suffix}."""
+
 MAX_CONTENT_BYTES = 200_000_000
 """Of a log that is read as a whole, decompressed; the largest public one has 20 MB."""
 
@@ -53,13 +56,9 @@ def open_log(
 
         return open_simulated(path, window)
     path = Path(path)
-    if path.is_dir():
-        return _open_bag(_bag_folder(path), window, scan_topic, odom_topic, marks_topic)
-    head = _read_head(path)
-    for magic, suffix in ((_MCAP, ".mcap"), (_SQLITE, ".db3")):
-        if head.startswith(magic):
-            return _open_bag(_check_suffix(path, suffix), window, scan_topic, odom_topic, marks_topic)
-    return _open_file(path, head, window)
+    if is_bag(path):
+        return _open_bag(find_bag(path), window, scan_topic, odom_topic, marks_topic)
+    return _open_file(path, _read_head(path), window)
 
 
 def is_simulated(path: str | Path) -> bool:
@@ -68,9 +67,22 @@ def is_simulated(path: str | Path) -> bool:
 
 
 def is_bag(path: str | Path) -> bool:
-    """Whether a log that `open_log` took is a rosbag2."""
+    """Whether a log is a rosbag2, or a folder that can be nothing else."""
     path = Path(path)
-    return not is_simulated(path) and (path.is_dir() or _read_head(path).startswith((_MCAP, _SQLITE)))
+    return not is_simulated(path) and (path.is_dir() or _read_head(path).startswith(tuple(_BAGS)))
+
+
+def find_bag(path: Path) -> Path:
+    """The folder or file of a rosbag2.
+
+    :raises HmtSlamError: where it is none, or a file has the suffix of another format.
+    """
+    if not is_bag(path):
+        raise HmtSlamError(f"{path} is no rosbag2: give a bag folder, or a .mcap or .db3 file.")
+    if path.is_dir():
+        return _bag_folder(path)
+    head = _read_head(path)
+    return _check_suffix(path, next(suffix for magic, suffix in _BAGS.items() if head.startswith(magic)))
 
 
 def _open_bag(path: Path, window: TimeWindow, scan_topic: str, odom_topic: str, marks_topic: str) -> Log:

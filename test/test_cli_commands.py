@@ -17,7 +17,7 @@ from hmt_slam_ros.configuration import Configuration, as_nested, load_configurat
 
 ROOT = Path(__file__).resolve().parents[1]
 BAG = ROOT / "data" / "malaga_one_loop"
-COMMANDS = ("map", "replay", "convert", "simulate", "evaluate", "plot", "export", "parameters")
+COMMANDS = ("map", "replay", "view", "convert", "simulate", "evaluate", "plot", "export", "parameters")
 SCAN_LINE = "FLASER 3 1.0 1.1 1.2 {x} 0 0 {x} 0 0 {t} robot {t}\n"
 
 

@@ -4,14 +4,18 @@ The screenshots stay in the folder HMT_SLAM_SCREENSHOTS, or in pytest's own.
 """
 
 import json
+import signal
 import socket
+import time
 from collections import Counter
 from pathlib import Path
 from urllib.request import urlopen
 
 import numpy as np
+import preloaded
 import pytest
 from browser import Browser, Page, find_browser, screenshot_folder
+from conftest import WAIT
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -19,6 +23,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.qos import HistoryPolicy, QoSProfile
+from recording import Recording
 from std_msgs.msg import Float64MultiArray, String
 from visualization_msgs.msg import MarkerArray
 
@@ -84,7 +89,10 @@ def snapshot(port):
         return json.load(answer)
 
 
-def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(listener, start, browser, screenshots):
+def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_in_a_browser_and_from_a_recording(
+    listener, start, browser, screenshots, tmp_path
+):
+    recording = Recording(listener, tmp_path / "bag")
     maps = listener.subscribe(OccupancyGrid, MAP, topics.LATCHED)
     graphs = listener.subscribe(MarkerArray, GRAPH, topics.LATCHED)
     particles = listener.subscribe(PoseArray, PARTICLES, topics.STREAM)
@@ -125,10 +133,11 @@ def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_and_in_a_browser(li
         pairs = {(t.header.frame_id, t.child_frame_id) for message in transforms for t in message.transforms}
         assert ("map", "odom") in pairs
         assert ("odom", "base_link") in pairs
+    listener.spin(3.5)  # tlca draws every 3 s
+    assert_recorded_page(recording, nodes[0], port)
     if browser is None:
         pytest.skip("the topics are well; the page was not looked at, as there is no browser: apt install chromium")
 
-    listener.spin(3.5)  # tlca draws every 3 s
     page.until(lambda: "ended" in page.text("replay") and page.drawing["map"])
     page.until(lambda: page.drawing["areas"] == groups_of(graphs[-1])["areas"])
     assert_page(page, port, graphs[-1], pmfs[-1])
@@ -149,6 +158,39 @@ def assert_screens(page, port, screenshots):
     page.browser.screenshot(screenshots / "dark.png")
     page.browser.dark(False)
     assert_phone(page, screenshots)
+
+
+def assert_recorded_page(recording, view, live_port):
+    """The page of the bag shows what the live one does."""
+    with urlopen(f"http://127.0.0.1:{live_port}/news", timeout=20):
+        wait_for(lambda: "map" in snapshot(live_port), view)
+    recording.close()
+    live, port = snapshot(live_port), free_port()
+    with preloaded.start(preloaded.COMMAND, "view", recording.folder, "--rate", "0", "--port", port) as viewer:
+        wait_for(lambda: is_served(port), viewer)
+        with urlopen(f"http://127.0.0.1:{port}/news", timeout=20):
+            wait_for(lambda: "map" in snapshot(port) and snapshot(port)["recording"]["ended"], viewer)
+        recorded = snapshot(port)
+        pictures = [urlopen(f"http://127.0.0.1:{n}/map.png", timeout=20).read() for n in (live_port, port)]
+        viewer.send_signal(signal.SIGINT)
+    assert viewer.returncode == 0
+    for section in ("about", "robot", "area", "graph", "localized", "entropy", "replay", "map", "history", "verdict"):
+        assert recorded[section] == live[section], section
+    assert pictures[0] == pictures[1]
+    rows = [{(row["name"], row["level"], row["message"]) for row in page["nodes"]} for page in (live, recorded)]
+    assert rows[0] == rows[1]
+    assert {row["topic"] for row in live["topics"] if row["age"] is not None} == {
+        row["topic"] for row in recorded["topics"] if row["age"] is not None
+    }
+
+
+def wait_for(condition, process):
+    """Wait until a condition holds while a process runs."""
+    deadline = time.monotonic() + WAIT
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        assert process.poll() is None
+        time.sleep(0.1)
 
 
 def assert_map(grid):

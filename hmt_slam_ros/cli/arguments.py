@@ -34,6 +34,7 @@ def build_parser() -> argparse.ArgumentParser:
     for add_arguments, module, name, description in (
         (_add_map_arguments, "run_commands", "map", "map a log, all in one process, the same for one seed"),
         (_add_replay_arguments, "run_commands", "replay", "map a log by a simulated robot and the ROS nodes"),
+        (_add_view_arguments, "view_commands", "view", "serve the live page of a recorded run"),
         (_add_convert_arguments, "log_commands", "convert", "write a log as a rosbag2"),
         (_add_simulate_arguments, "log_commands", "simulate", "write a drive through a simulated world as a rosbag2"),
         (_add_merge_arguments, "merge_commands", "merge", "join maps where they show the same ground"),
@@ -130,6 +131,23 @@ def _add_replay_arguments(command: argparse.ArgumentParser) -> None:
         metavar="PORT",
         help=f"serve the live page of the run on 127.0.0.1, port {_VIEW_PORT} where none is given",
     )
+
+
+def _add_view_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 of all topics of a run: folder, .mcap or .db3")
+    command.add_argument("--rate", type=_rate, default=1.0, metavar="F", help="speed; 0 for as fast as possible")
+    command.add_argument("--port", type=int, default=_VIEW_PORT, metavar="PORT", help="of the page, on 127.0.0.1")
+    command.add_argument("--namespace", metavar="NAME", help="robot of the page, where several were recorded")
+
+
+def _rate(text: str) -> float:
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = -1.0
+    if not 0.0 <= rate < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is no speed: give 0 or more")
+    return rate
 
 
 def _add_log_and_output(command: argparse.ArgumentParser) -> None:

@@ -38,9 +38,10 @@ _REMEDY = "copy or record it anew, or repair it with 'ros2 bag reindex'."
 
 
 class BagMessage(NamedTuple):
-    """A serialized message: its bag time, ns, its type, and its bytes in CDR."""
+    """A serialized message: its bag time, ns, its topic, its type, and its bytes in CDR."""
 
     bag_time: int
+    topic: str
     kind: str
     content: bytes
 
@@ -108,7 +109,7 @@ def _read_file(file: Path, topics: Collection[str]) -> Iterator[BagMessage]:
         if not connections:
             return
         for connection, bag_time, content in reader.messages(connections):
-            yield BagMessage(bag_time, connection.msgtype, bytes(content))
+            yield BagMessage(bag_time, connection.topic, connection.msgtype, bytes(content))
 
 
 def _unpack_messages(messages: Iterator[BagMessage], path: Path) -> Iterator[BagMessage]:

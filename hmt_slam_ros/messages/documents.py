@@ -28,6 +28,17 @@ from hmt_slam_ros.untrusted_input import parse_json, shorten
 Document = TypeVar("Document")
 
 
+class DocumentVersionError(HmtSlamError):
+    """A document has another version.
+
+    :ivar difference: which document, with both versions.
+    """
+
+    def __init__(self, difference: str) -> None:
+        super().__init__(f"{difference}: run the same version of hmt_slam_ros everywhere")
+        self.difference = difference
+
+
 @dataclass(frozen=True, eq=False)
 class ScanGeometry:
     """A :class:`~hmt_slam_ros.sensors.Scan` without its ranges, which travel as a LaserScan."""
@@ -217,10 +228,7 @@ def decode_with_reset(
             f"a document that is no {name} came on its topic: see docs/reference/messages.md for its form"
         )
     if (found := content.pop("version", None)) != version:
-        raise HmtSlamError(
-            f"a {name} document has version {shorten(found)}, not {version}: run the same version of hmt_slam_ros "
-            "everywhere"
-        )
+        raise DocumentVersionError(f"a {name} document has version {shorten(found)}, not {version}")
     admit(_VALUES.read(content.pop("system", ""), str, f"{name}.system"))
     reset_number = _VALUES.read(content.pop("reset", 0), int, f"{name}.reset")
     return _VALUES.read(content, kind, name), reset_number

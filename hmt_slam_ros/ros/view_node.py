@@ -56,7 +56,7 @@ from hmt_slam_ros.view.incidents import IncidentLog
 from hmt_slam_ros.view.run_events import RunEvents
 from hmt_slam_ros.view.server import LOCAL, PORT, PageServer, grid_png
 
-_PERIOD = 0.2
+PERIOD = 0.2
 """Time between two updates, s; DDS keeps only the newest message of a stream meanwhile."""
 _LONGEST_STEP = 1.0
 """Most listening time that an update counts, s; more means that the computer stood still."""
@@ -98,12 +98,12 @@ _PUBLISHERS = {
 class ViewNode(GuardedNode):
     """The node ``view``."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, **options: Any) -> None:  # noqa: ANN401  Node's own
         """Start the server.
 
         :raises HmtSlamError: for an invalid address or port.
         """
-        super().__init__(name)
+        super().__init__(name, **options)
         self.diagnostics = NodeDiagnostics(self, declare_system(self))
         self.board = Board()
         self._health, self._history = SystemHealth(process_names()), KeyframeHistory(self.board, self._begin_run)
@@ -139,7 +139,7 @@ class ViewNode(GuardedNode):
         self._team = TeamView(self.board, self._subscribe, self.destroy_subscription)
         self._layers = MapLayers(self.board, self._subscribe, self.destroy_subscription, self.diagnostics)
         self._controls = ViewControls(self, self.board, commands, lambda: self._layers.sections.frame)
-        self._publish_health()
+        self._publish_health(time.time())
         key = f"#token={commands.token}" if commands.token else ""
         self.get_logger().info(f"the page is at {self._server.url}{key}")
 
@@ -186,17 +186,24 @@ class ViewNode(GuardedNode):
         try:
             last = time.monotonic()
             while rclpy.ok():
-                time.sleep(_PERIOD)
+                time.sleep(PERIOD)
                 now = time.monotonic()
                 self._listening_time, last = self._listening_time + min(now - last, _LONGEST_STEP), now
                 self._spin_pending(executor)
-                self._history.publish_complete()
-                self._update_layers()
-                self._publish_health()
-                self._update_map_subscription()
-                self._team.update()
+                self.update_page(time.time())
         finally:
             executor.shutdown()
+
+    def update_page(self, time_of_day: float) -> None:
+        """Show what came since the last update.
+
+        :param time_of_day: s since the epoch.
+        """
+        self._history.publish_complete()
+        self._update_layers()
+        self._publish_health(time_of_day)
+        self._update_map_subscription()
+        self._team.update()
 
     def _spin_pending(self, executor: SingleThreadedExecutor) -> None:
         idle = 0
@@ -221,12 +228,12 @@ class ViewNode(GuardedNode):
             self.destroy_subscription(self._map_subscription)
             self._map_subscription = None
 
-    def _publish_health(self) -> None:
+    def _publish_health(self, time_of_day: float) -> None:
         now = self._listening_time
         self._health.second_system = self.diagnostics.system.other
         self.board.put("verdict", self._health.verdict(now))
         self.board.put("nodes", self._health.rows(now))
-        for incident in self._incidents.update(self._health.nodes, now, time.time()):
+        for incident in self._incidents.update(self._health.nodes, now, time_of_day):
             self.get_logger().info(f"{incident.node}: {incident.text}")
             self._events.add_incident(f"{incident.node}: {incident.text}")
             self._incident_publisher.publish(incident_message(incident, self.get_namespace()))
