@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -137,7 +138,9 @@ def _process_scan(live: LiveHypothesis, motion: MotionModel, number: int, prepar
         match = live.filter.track(prepared_scan, prediction)
         motion.observe(match.increment, match.information, match.contradicts_odometry)
     if not number or live.is_event_due(prepared_scan):
-        live.process_keyframe(number, prepared_scan, after_reset=number == 0)
+        scans = dict.fromkeys(live.filter.keyframes, prepared_scan.scan)
+        is_new = partial(live.is_new_viewpoint, prepared_scan.scan, scans)
+        live.process_keyframe(number, prepared_scan, after_reset=number == 0, is_informative=is_new)
         motion.observe_keyframe(live.event.motion, live.event.match_information)
 
 

@@ -1,6 +1,7 @@
 """How far off a live hypothesis takes its pose to be in its area's frame."""
 
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
@@ -43,7 +44,8 @@ class Drive:
         prepared = PreparedScan(self.mapping, scan)
         if sequence:
             self.live.filter.track(prepared, Prediction(step, step, step))
-        return self.live.process_keyframe(sequence, prepared, after_reset=sequence == 0)
+        is_new = partial(self.live.is_new_viewpoint, scan, self.scans)
+        return self.live.process_keyframe(sequence, prepared, after_reset=sequence == 0, is_informative=is_new)
 
     def drive_along(self, poses, walls=CORRIDOR):
         return [self.drive_to(pose, walls) for pose in poses]
@@ -138,7 +140,7 @@ def test_the_first_scan_of_a_map_is_stored_whatever_it_shows():
     assert len(scan.surfels) == 0
     step = RelativeMotion(np.zeros(3), ODOMETRY)
     live.filter.track(scan, Prediction(step, step, step))
-    assert live.process_keyframe(0, scan).stored
+    assert live.process_keyframe(0, scan, is_informative=lambda: False).stored
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ for part in (*PARTS.values(), MapDocument, ChainState, ScanTable):
     records_of(part, RECORDS)
 
 
-FORM = (31, "c807fe8bba434b7a")
+FORM = (32, "cb286d621a21ab4a")
 """Version of the format, and the digest of all fields and types: a change of one is a change of both."""
 
 

@@ -31,7 +31,7 @@ from hmt_slam_ros.hybrid_map.hybrid_map import (
     area_pair,
     has_foreign_keyframes,
 )
-from hmt_slam_ros.hybrid_map.keyframe_pruning import is_same_viewpoint, redundant_keyframes
+from hmt_slam_ros.hybrid_map.keyframe_pruning import is_same_viewpoint, looks_alike, redundant_keyframes
 from hmt_slam_ros.hybrid_map.shortest_path import informative_arc
 from hmt_slam_ros.messages.map_changes import AreaMerge, PrunedKeyframe
 from hmt_slam_ros.messages.messages import (
@@ -174,12 +174,16 @@ class Aam:
         poses = self._keyframes(hypothesis, partition.area)
         if arc is None or not entered_poses.size:
             return ()
-        first = next(iter(poses))
-        return tuple(
-            PrunedKeyframe(k, partition.area)
-            for k in sorted(partition.new_keyframes & poses.keys() - {first})
-            if is_same_viewpoint(se2.between(entered_poses, se2.compose(arc.mean, poses[k])), self._filter).any()
-        )
+        first, scans = next(iter(poses)), self._replica.scans
+        mountings = np.array([scans[k].laser_pose for k in self._keyframes(hypothesis, entered)])
+
+        def is_known_view(keyframe: int) -> bool:
+            relative = se2.between(entered_poses, se2.compose(arc.mean, poses[keyframe]))
+            alike = looks_alike(scans[keyframe].laser_pose, mountings, self._filter)
+            return bool((is_same_viewpoint(relative, self._filter) & alike).any())
+
+        candidates = sorted(partition.new_keyframes & poses.keys() - {first})
+        return tuple(PrunedKeyframe(k, partition.area) for k in candidates if is_known_view(k))
 
     def _redundant_after_leaving(self, hypothesis: int, newest: int) -> tuple[PrunedKeyframe, ...]:
         """The redundant keyframes of an area that the robot left."""
@@ -193,7 +197,8 @@ class Aam:
         recent = {k for k in poses if k > newest - _RECENT_EVENTS}
         foreign = {k for k in poses if k < NO_KEYFRAME}
         protected = recent | foreign | self._state.partitions[hypothesis].new_keyframes | set(list(poses)[:1])
-        redundant = redundant_keyframes(poses, protected, self._options.keyframes_per_place, self._filter)
+        most = self._options.keyframes_per_place
+        redundant = redundant_keyframes(poses, self._replica.scans, protected, most, self._filter)
         return tuple(PrunedKeyframe(k, area) for k in redundant)
 
     def _sense(self, scan: Scan) -> SensedSpace:

@@ -14,6 +14,7 @@ import numpy as np
 from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.configuration.metric_slam import FilterParameters
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.sensors import Scan
 
 Pose = Float64
 
@@ -42,6 +43,16 @@ def is_same_viewpoint(relative: Float64, settings: FilterParameters) -> Bool:
     return np.asarray(is_near & is_aligned, dtype=np.bool_)
 
 
+def looks_alike(mounting: Pose, mountings: Float64, settings: FilterParameters) -> Bool:
+    """Which lasers look from the place of another one into its direction, so that one viewpoint is enough for both.
+
+    :param mounting: ``base_T_laser`` of that laser, shape (3,) or (n, 1, 3), m and rad.
+    :param mountings: those of the others, shape (n, 3).
+    :returns: shape (n,), or (n, n).
+    """
+    return is_same_viewpoint(se2.between(mounting, mountings), settings)
+
+
 def nearest_replacement(pose: Pose, others: Mapping[int, Pose]) -> ReplacementKeyframe:
     """The nearest of other keyframes; a turn by one radian counts as much as a meter.
 
@@ -55,7 +66,11 @@ def nearest_replacement(pose: Pose, others: Mapping[int, Pose]) -> ReplacementKe
 
 
 def redundant_keyframes(
-    keyframe_poses: Mapping[int, Pose], protected: Collection[int], max_per_viewpoint: int, settings: FilterParameters
+    keyframe_poses: Mapping[int, Pose],
+    scans: Mapping[int, Scan],
+    protected: Collection[int],
+    max_per_viewpoint: int,
+    settings: FilterParameters,
 ) -> list[int]:
     """The keyframes to prune so that no viewpoint has too many.
 
@@ -63,6 +78,7 @@ def redundant_keyframes(
     viewpoints, and of equals the oldest, so that a map follows a world that changes.
 
     :param keyframe_poses: {keyframe: ``area_T_base``} of one area.
+    :param scans: {keyframe: its scan}; those of lasers that look elsewhere have other viewpoints.
     :param protected: keyframes that stay in any case.
     :param max_per_viewpoint: most keyframes at the viewpoint of any of them.
     :returns: in that order.
@@ -71,7 +87,9 @@ def redundant_keyframes(
         return []
     keyframes = np.array(sorted(keyframe_poses))
     poses = np.array([keyframe_poses[keyframe] for keyframe in sorted(keyframe_poses)])
+    mountings = np.array([scans[keyframe].laser_pose for keyframe in keyframes.tolist()])
     is_shared = is_same_viewpoint(se2.between(poses[:, None], poses), settings)
+    is_shared &= looks_alike(mountings[:, None], mountings, settings)
     is_prunable = ~np.isin(keyframes, list(protected))
     pruned: list[int] = []
     while True:

@@ -14,7 +14,12 @@ from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.configuration.metric_slam import FilterParameters
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.hybrid_map.keyframe_pruning import ReplacementKeyframe, is_same_viewpoint, nearest_replacement
+from hmt_slam_ros.hybrid_map.keyframe_pruning import (
+    ReplacementKeyframe,
+    is_same_viewpoint,
+    looks_alike,
+    nearest_replacement,
+)
 from hmt_slam_ros.lifelong.change_detection import RecentScan, append_recent_scan
 from hmt_slam_ros.messages.map_changes import AreaMerge, MovedKeyframe
 from hmt_slam_ros.messages.messages import Hypothesis, HypothesisEstimate, ScanPoses
@@ -60,6 +65,22 @@ class KeyframeCovariances:
         return dict(zip(self.keyframes.tolist(), self.covariances, strict=True))
 
 
+_MAX_LASERS = 8
+"""Lasers that look into different directions."""
+
+
+@dataclass(frozen=True, eq=False)
+class LaserEvent:
+    """The last keyframe event with the scan of a laser.
+
+    :ivar laser_pose: ``base_T_laser``, shape (3,), m and rad.
+    :ivar pose: ``area_T_base`` at the event, shape (3,), m and rad.
+    """
+
+    laser_pose: Float64
+    pose: Float64
+
+
 @dataclass(frozen=True, eq=False)
 class LastEvent:
     """The last keyframe event of a hypothesis.
@@ -73,6 +94,7 @@ class LastEvent:
     :ivar blind_drift: drift since the newest keyframe over scans that showed nothing, likewise.
     :ivar contradicted: whether the scan contradicted the submap.
     :ivar recent_scans: scans with which that of the next keyframe is compared, in mode lifelong.
+    :ivar lasers: the last event of each laser, that of this event at the end.
     """
 
     pose: Float64 = field(default_factory=lambda: np.zeros(3))
@@ -84,6 +106,7 @@ class LastEvent:
     blind_drift: Float64 = field(default_factory=lambda: np.zeros((3, 3)))
     contradicted: bool = False
     recent_scans: tuple[RecentScan, ...] = ()
+    lasers: tuple[LaserEvent, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,11 +182,14 @@ class LiveHypothesis:
         )
 
     def is_event_due(self, prepared: PreparedScan) -> bool:
-        """Whether the robot moved far enough since the last keyframe event, or the scan is the first to contradict.
+        """Whether the robot moved far enough since the laser's last keyframe event, or the scan first contradicts.
 
         :param prepared: the newest scan.
         """
-        motion = se2.between(self.event.pose, self.filter.pose)
+        own, _ = self._split_lasers(prepared.scan)
+        if own is None:
+            return True
+        motion = se2.between(own.pose, self.filter.pose)
         is_far = math.hypot(motion[0], motion[1]) >= self.settings.keyframe_distance
         if is_far or abs(motion[2]) >= math.radians(self.settings.keyframe_angle):
             return True
@@ -172,6 +198,16 @@ class LiveHypothesis:
         evidence = self.filter.clutter_estimate.evaluate(self.filter.compare_scan(prepared))
         return evidence.log_kidnapping_ratio > self.settings.contradiction_evidence
 
+    def _split_lasers(self, scan: Scan) -> tuple[LaserEvent | None, tuple[LaserEvent, ...]]:
+        """The last event of a laser that looks like that of a scan, None without, and those of all others."""
+        lasers = self.event.lasers
+        if not lasers:
+            return None, ()
+        mountings = np.array([laser.laser_pose for laser in lasers])
+        alike = looks_alike(scan.laser_pose, mountings, self.settings).tolist()
+        own = next((laser for laser, is_alike in zip(lasers, alike, strict=True) if is_alike), None)
+        return own, tuple(laser for laser, is_alike in zip(lasers, alike, strict=True) if not is_alike)
+
     def process_keyframe(
         self,
         sequence: int,
@@ -179,7 +215,7 @@ class LiveHypothesis:
         *,
         after_reset: bool = False,
         may_store: bool = True,
-        is_informative: Callable[[], bool] | None = None,
+        is_informative: Callable[[], bool],
     ) -> HypothesisEstimate:
         """One filter step with the scan of a keyframe, which enters the map if it is informative.
 
@@ -187,7 +223,7 @@ class LiveHypothesis:
         :param prepared: the scan.
         :param after_reset: whether tracking was reset: the scan is not matched.
         :param may_store: whether the hypothesis's map may change.
-        :param is_informative: whether the scan is, called after the filter step; :meth:`is_new_viewpoint` if None.
+        :param is_informative: whether the scan is, called after the filter step; such as :meth:`is_new_viewpoint`.
         """
         if after_reset:
             step = FilterStep(np.zeros(3), _NO_ERROR, np.zeros((3, 3)), float(len(self.filter.poses)), False)
@@ -206,11 +242,13 @@ class LiveHypothesis:
         is_first, is_blind = after_reset or not self.filter.keyframes, prepared.is_blind
         may_enter = may_store and not is_blind
         # A scan that contradicts may be the first after a displacement.
-        stored = is_first or (may_enter and ((is_informative or self.is_new_viewpoint)() or self.event.contradicted))
+        stored = is_first or (may_enter and (is_informative() or self.event.contradicted))
         self._propagate_covariance(sequence if stored else None, is_blind=is_blind)
         if stored:
             self.filter.add_keyframe(sequence, prepared.scan)
-        self.event = replace(self.event, pose=self.filter.pose, anchor=self._nearest_keyframe())
+        _, others = self._split_lasers(prepared.scan)
+        lasers = (*others, LaserEvent(prepared.scan.laser_pose, self.filter.pose))[-_MAX_LASERS:]
+        self.event = replace(self.event, pose=self.filter.pose, anchor=self._nearest_keyframe(), lasers=lasers)
         return HypothesisEstimate(
             self.filter.hypothesis,
             self.filter.area,
@@ -236,12 +274,18 @@ class LiveHypothesis:
         recent = append_recent_scan(self.event.recent_scans, RecentScan(scan, self.filter.pose.copy()))
         self.event = replace(self.event, recent_scans=recent)
 
-    def is_new_viewpoint(self) -> bool:
-        """Whether no keyframe of the local map has a similar position and heading."""
+    def is_new_viewpoint(self, scan: Scan, scans: Mapping[int, Scan]) -> bool:
+        """Whether no keyframe of the local map has a similar position and heading, by a laser that looks alike.
+
+        :param scan: taken at the current pose.
+        :param scans: {keyframe: its scan}.
+        """
         if not self.filter.keyframes:
             return True
         relative = se2.between(self.filter.leading_keyframe_poses(), self.filter.pose)
-        return not bool(np.any(is_same_viewpoint(relative, self.settings)))
+        mountings = np.array([scans[keyframe].laser_pose for keyframe in self.filter.keyframes])
+        alike = looks_alike(scan.laser_pose, mountings, self.settings)
+        return not bool(np.any(is_same_viewpoint(relative, self.settings) & alike))
 
     def _propagate_covariance(self, keyframe: int | None, *, is_blind: bool) -> None:
         """Propagate the drift to the current pose: that of a stored keyframe, or on mapped ground if None.
@@ -377,7 +421,8 @@ class LiveHypothesis:
     def _move_event(self, move: Callable[[Float64], Float64]) -> None:
         """Move the poses of the last event, each shape (3,)."""
         recent = tuple(RecentScan(recent.scan, move(recent.pose)) for recent in self.event.recent_scans)
-        self.event = replace(self.event, pose=move(self.event.pose), recent_scans=recent)
+        lasers = tuple(LaserEvent(laser.laser_pose, move(laser.pose)) for laser in self.event.lasers)
+        self.event = replace(self.event, pose=move(self.event.pose), recent_scans=recent, lasers=lasers)
 
     def merge(self, merged: AreaMerge, keyframes: Mapping[int, Float64]) -> None:
         """Add the uncertainty of an area's pose to covariances of what becomes part of another area with it.

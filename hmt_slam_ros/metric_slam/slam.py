@@ -271,6 +271,11 @@ class MetricSlam:
         """Add a keyframe to the maps of the live hypotheses."""
         self._replica.add_keyframe(keyframe)
 
+    @property
+    def keyframe_scans(self) -> Mapping[int, Scan]:
+        """{keyframe: its scan} of the live hypotheses."""
+        return self._replica.scans
+
     def release(self) -> None:
         """Free the maps of all filters."""
         for live in self._live_hypotheses.values():
@@ -374,7 +379,9 @@ class MetricSlam:
                 prepared,
                 after_reset=self._state.reset_pending,
                 may_store=may_store,
-                is_informative=partial(self._shows_changes, live, scan, changes) if self._is_lifelong else None,
+                is_informative=partial(self._shows_changes, live, scan, changes)
+                if self._is_lifelong
+                else partial(live.is_new_viewpoint, scan, self.keyframe_scans),
             )
             for live in self._live_hypotheses.values()
         )

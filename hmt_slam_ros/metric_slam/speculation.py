@@ -8,8 +8,8 @@ processed again. Both ways the messages are those of metric SLAM alone, in the s
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections import ChainMap, deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ from hmt_slam_ros.messages.messages import (
 )
 from hmt_slam_ros.metric_slam.look_ahead import LookAhead
 from hmt_slam_ros.metric_slam.slam import MetricSlam, SlamState
-from hmt_slam_ros.sensors import Measurement, Odometry
+from hmt_slam_ros.sensors import Measurement, Odometry, Scan
 from hmt_slam_ros.submap.local_filter import FilterFactory
 from hmt_slam_ros.submap.local_mapping import LocalMapping
 from hmt_slam_ros.submap.particle_filter import ParticleFilters
@@ -75,22 +75,31 @@ class _Fork(MetricSlam):
 
     :ivar answers: the messages that follow the answer at once.
     :ivar seconds: computing time, s.
+    :ivar assumed_scans: {keyframe that is no part of the map yet: its scan}.
     """
 
     answers: list[Message]
     seconds: float
+    assumed_scans: dict[int, Scan]
 
     @classmethod
     def from_slam(cls, slam: MetricSlam) -> _Fork:
         """A copy in the same state."""
         fork = cls.__new__(cls)
-        vars(fork).update(vars(slam), answers=[], seconds=0.0)
+        assumed = slam.assumed_scans if isinstance(slam, _Fork) else {}
+        vars(fork).update(vars(slam), answers=[], seconds=0.0, assumed_scans=assumed)
         fork.intake = slam.intake.copy()
         fork._live_hypotheses = {name: live.branch(name) for name, live in fork._live_hypotheses.items()}
         return fork
 
     def add_to_replica(self, keyframe: Keyframe) -> None:
-        """Add nothing: the keyframe is part of the map once the copy is adopted."""
+        """Keep the scan alone: the keyframe is part of the map once the copy is adopted."""
+        self.assumed_scans = {**self.assumed_scans, keyframe.sequence: keyframe.scan}
+
+    @property
+    def keyframe_scans(self) -> Mapping[int, Scan]:
+        """As of metric SLAM, with the keyframes that are no part of the map yet."""
+        return ChainMap(self.assumed_scans, self._replica.scans)
 
     def assume_unchanged(self) -> list[Message]:
         """Go on as if the answer that is due changed nothing; returns the messages of the scans that waited."""

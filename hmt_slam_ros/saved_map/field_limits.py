@@ -53,6 +53,8 @@ _SHAPES: Mapping[str, Mapping[str, str]] = {
     "JoinedGraph": {"arc": "3"},
     "KeyframeCovariances": {"keyframes": "n", "covariances": "n 3 3"},
     "Landmark": {"scatter": "3 3", "scan_covariance_share": "3 3"},
+    "LaserEvent": {"laser_pose": "3", "pose": "3"},
+    "LaserPeriods": {"laser_pose": "3"},
     "LastEvent": {
         "pose": "3",
         "motion": "3",
@@ -181,7 +183,9 @@ _LIMITS: Mapping[str, tuple[float, float]] = {
     **dict.fromkeys(("probability", "probabilities", "unexamined", "presence", "confidence", "similarity"), _SHARE),
     **dict.fromkeys(("pose", "poses", "mean", "means", "increment", "motion", "odometry", "motions"), _POSE),
     **dict.fromkeys(("keyframe_poses", "predicted_poses", "last_poses", "reported_poses", "laser_poses"), _POSE),
-    **dict.fromkeys(("odometry_pose", "online_trajectory", "measured", "reset_free", "segments", "arc"), _POSE),
+    **dict.fromkeys(
+        ("odometry_pose", "online_trajectory", "measured", "reset_free", "segments", "arc", "laser_pose"), _POSE
+    ),
     **dict.fromkeys(
         ("path_length", "branched_at", "width", "width_deviation", "weighted_ratios", "weights"), _POSITIVE
     ),

@@ -25,7 +25,7 @@ from hmt_slam_ros.saved_map.validation import check_record
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.untrusted_input import MAX_FILE_BYTES, is_short_text, parse_json, read_file, shorten
 
-FORMAT, VERSION = "hmt_map", 31
+FORMAT, VERSION = "hmt_map", 32
 """Format of a saved map, and the version of its documents."""
 
 HMT_MAP = "hmt_map"

@@ -199,20 +199,36 @@ _JITTER = 1.2
 """Duration of a sweep at most, as a factor on the median period: stamps jitter."""
 
 
+_MAX_LASERS = 32
+"""Lasers whose periods are kept, those of the last scans."""
+
+
+@dataclass(frozen=True, eq=False)
+class LaserPeriods:
+    """Times between the scans of one laser.
+
+    :ivar laser_pose: ``base_T_laser``, shape (3,), m and rad, by which lasers are distinguished.
+    :ivar last_stamp: of the last scan, ns.
+    :ivar periods: the last times between two scans, s.
+    """
+
+    laser_pose: Float64
+    last_stamp: int
+    periods: tuple[float, ...] = ()
+
+
 @dataclass(frozen=True)
 class SweepState:
     """Times between scans.
 
-    :ivar periods: the last times between two scans, s.
-    :ivar last_stamp: of the last scan, ns, None before the first.
+    :ivar lasers: the times of each laser, that of the last scan at the end.
     """
 
-    periods: tuple[float, ...] = ()
-    last_stamp: int | None = None
+    lasers: tuple[LaserPeriods, ...] = ()
 
 
 class SweepCheck:
-    """Check whether the sweeps of a laser can have the duration that ``time_increment`` gives.
+    """Check whether the sweeps of each laser can have the duration that ``time_increment`` gives.
 
     The result depends on the sequence of scans alone, not on how they mix with odometry.
 
@@ -225,11 +241,12 @@ class SweepCheck:
 
     def check(self, scan: Scan) -> tuple[Scan, str | None]:
         """The scan and the fault of its ``time_increment``, or None; a scan with a fault comes back without it."""
-        periods, last = self.state.periods, self.state.last_stamp
-        if last is not None:
-            periods = (*periods, (scan.stamp - last) * 1e-9)[-_PERIODS:]
-        self.state = SweepState(periods, scan.stamp)
-        fault = self._fault(scan)
+        is_own = [np.array_equal(laser.laser_pose, scan.laser_pose) for laser in self.state.lasers]
+        own = self.state.lasers[is_own.index(True)] if any(is_own) else None
+        others = tuple(laser for laser in self.state.lasers if laser is not own)
+        periods = () if own is None else (*own.periods, (scan.stamp - own.last_stamp) * 1e-9)[-_PERIODS:]
+        self.state = SweepState((*others, LaserPeriods(scan.laser_pose, scan.stamp, periods))[-_MAX_LASERS:])
+        fault = _sweep_fault(scan, periods)
         if fault is None:
             return scan, None
         return replace(scan, time_increment=0.0), (
@@ -237,21 +254,24 @@ class SweepCheck:
             "such scans are taken as if measured at one moment: correct it in the laser's driver, or set it to 0."
         )
 
-    def _fault(self, scan: Scan) -> str | None:
-        if not (math.isfinite(scan.time_increment) and scan.time_increment >= 0.0):
-            return "which is no time from one beam to the next"
-        if scan.sweep_duration > _MAX_SWEEP:
-            return (
-                f"so that its {scan.ranges.size} beams would take {scan.sweep_duration:.2f} s, more than "
-                f"{_MAX_SWEEP:g} s"
-            )
-        periods = self.state.periods
-        if len(periods) < _MIN_PERIODS or scan.sweep_duration <= _JITTER * median(periods):
-            return None
+
+def _sweep_fault(scan: Scan, periods: tuple[float, ...]) -> str | None:
+    """What is wrong with the ``time_increment`` of a scan, None where it can be.
+
+    :param periods: the last times between two scans of its laser, s.
+    """
+    if not (math.isfinite(scan.time_increment) and scan.time_increment >= 0.0):
+        return "which is no time from one beam to the next"
+    if scan.sweep_duration > _MAX_SWEEP:
         return (
-            f"so that its {scan.ranges.size} beams would take {scan.sweep_duration:.3f} s, longer than the "
-            f"{median(periods):.3f} s from one scan to the next"
+            f"so that its {scan.ranges.size} beams would take {scan.sweep_duration:.2f} s, more than {_MAX_SWEEP:g} s"
         )
+    if len(periods) < _MIN_PERIODS or scan.sweep_duration <= _JITTER * median(periods):
+        return None
+    return (
+        f"so that its {scan.ranges.size} beams would take {scan.sweep_duration:.3f} s, longer than the "
+        f"{median(periods):.3f} s from one scan to the next"
+    )
 
 
 _REACH = 0.5
