@@ -8,6 +8,7 @@ import lzma
 import zlib
 from pathlib import Path
 
+from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.carmen import is_carmen, open_carmen
 from hmt_slam_ros.logs.rawlog import is_rawlog, open_rawlog
@@ -33,7 +34,7 @@ _XZ_MEMORY, _PIECE = 200_000_000, 1 << 20
 def open_log(
     path: str | Path,
     *,
-    scan_topic: str = "/scan",
+    scan_topics: str = "/scan",
     odom_topic: str = "/odom",
     marks_topic: str = "",
     start: float = 0.0,
@@ -42,7 +43,7 @@ def open_log(
     """Open a rosbag2 (folder, .mcap, .db3), a CARMEN log (plain, .gz, .xz) or an MRPT rawlog, by its content.
 
     :param path: file or folder, or ``sim:WORLD,name=value,...`` for a simulated drive (docs/guides/simulation.md).
-    :param scan_topic: topic of a bag; where the default is missing, the only topic with scans.
+    :param scan_topics: topics of a bag, separated by commas; where the default is missing, the only topic with scans.
     :param odom_topic: topic of a bag, chosen likewise; without any, the transform odom -> base on /tf.
     :param marks_topic: topic of a bag with observations of marks, empty for none.
     :param start: start of the part to read after the log's first stamp, s.
@@ -57,8 +58,25 @@ def open_log(
         return open_simulated(path, window)
     path = Path(path)
     if is_bag(path):
-        return _open_bag(find_bag(path), window, scan_topic, odom_topic, marks_topic)
+        return _open_bag(find_bag(path), window, scan_topics, odom_topic, marks_topic)
     return _open_file(path, _read_head(path), window)
+
+
+def open_configured(path: str | Path, configuration: Configuration) -> Log:
+    """Open the part of a log that ``robot.start`` and ``robot.duration`` select, with the topics of the configuration.
+
+    :raises HmtSlamError: as :func:`open_log`, and where the part has no scans.
+    """
+    log = open_log(
+        path,
+        scan_topics=configuration.sensors.scan_topics,
+        marks_topic=configuration.marks.topic,
+        start=configuration.robot.start,
+        duration=configuration.robot.duration or None,
+    )
+    if not log.scan_count:
+        raise HmtSlamError(f"{path} has no scans in the part asked for: check --start and --duration")
+    return log
 
 
 def is_simulated(path: str | Path) -> bool:
@@ -85,10 +103,10 @@ def find_bag(path: Path) -> Path:
     return _check_suffix(path, next(suffix for magic, suffix in _BAGS.items() if head.startswith(magic)))
 
 
-def _open_bag(path: Path, window: TimeWindow, scan_topic: str, odom_topic: str, marks_topic: str) -> Log:
+def _open_bag(path: Path, window: TimeWindow, scan_topics: str, odom_topic: str, marks_topic: str) -> Log:
     from hmt_slam_ros.logs.bag import BagLog  # noqa: PLC0415  the rosbags library takes memory
 
-    return BagLog(path, window, scan_topic, odom_topic, marks_topic)
+    return BagLog(path, window, scan_topics, odom_topic, marks_topic)
 
 
 def _open_file(path: Path, head: bytes, window: TimeWindow) -> Log:

@@ -20,6 +20,7 @@ class Purpose(IntEnum):
     LASER = 105
     CHANGES = 106
     MARKS = 107
+    REAR_LASER = 108
 
 
 def random_stream(seed: int, purpose: Purpose, step: int) -> np.random.Generator:

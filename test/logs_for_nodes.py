@@ -13,6 +13,7 @@ from hmt_slam_ros.sensors import Odometry
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 LASER = np.array([0.1, 0.0, 0.05])
+REAR_LASER = np.array([-0.2, 0.1, 3.0])
 PACE = np.array([0.025, 0.0, 0.002])
 BEAMS = 91
 MAPPED_SCANS = 120
@@ -26,6 +27,7 @@ class Corridor:
 
     Before the scan of a number the robot is kidnapped along its route, by the path of ``carried`` scans.
     While the laser is ``silent``, from one scan to before another, only odometry comes.
+    A rear laser scans in the middle of the time between two scans.
     """
 
     scans: int = 12
@@ -34,10 +36,11 @@ class Corridor:
     carried: tuple[int, int] = (0, 0)
     beams: int = BEAMS
     silent: range = range(0)
+    has_rear_laser: bool = False
 
     @property
     def scan_count(self):
-        return self.scans - len(self.silent)
+        return self.scans - len(self.silent) + (self.scans - 1) * self.has_rear_laser
 
     @property
     def duration(self):
@@ -48,10 +51,14 @@ class Corridor:
             stamp = START + k * SECOND // 20
             yield LogRecord(stamp, Odometry(stamp, k * PACE))
             if k % 4 == 0 and k // 4 not in self.silent:
-                along = k + 4 * self.carried[1] * (k >= 4 * self.carried[0])
-                poses = (along + 20.0 * self.sweep * np.linspace(0.0, 1.0, self.beams)[:, None]) * PACE
-                scan = scan_in(WALLS, poses, stamp, beams=self.beams, laser_pose=LASER, sweep=self.sweep)
-                yield LogRecord(stamp, scan)
+                yield LogRecord(stamp, self._scan(k, stamp, LASER))
+            elif k % 4 == 2 and self.has_rear_laser:
+                yield LogRecord(stamp, self._scan(k, stamp, REAR_LASER))
+
+    def _scan(self, k, stamp, laser_pose):
+        along = k + 4 * self.carried[1] * (k >= 4 * self.carried[0])
+        poses = (along + 20.0 * self.sweep * np.linspace(0.0, 1.0, self.beams)[:, None]) * PACE
+        return scan_in(WALLS, poses, stamp, beams=self.beams, laser_pose=laser_pose, sweep=self.sweep)
 
 
 def corridor_bag(folder, scans=12, **others):

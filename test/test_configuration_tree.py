@@ -40,6 +40,8 @@ def values_of(parameter: FlatParameter) -> st.SearchStrategy:
         return st.booleans()
     if parameter.kind is int:
         return st.integers(int(parameter.low), int(parameter.high))
+    if parameter.kind is str:
+        return words
     return st.floats(parameter.low, parameter.high)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.sensors import Scan
 
 WORLD = "sim:office,seed=3,beams=181,readings=4"
+TWO_LASERS = f"{WORLD},lasers=2,forward=0.2"
 
 
 class Faulty:
@@ -447,3 +449,53 @@ def test_the_command_says_what_is_wrong_and_returns_it(drive, tmp_path, capsys):
 def test_the_command_refuses_what_it_cannot_examine(arguments, capsys):
     assert main(["doctor", *arguments]) == 2
     assert capsys.readouterr().err.startswith("hmt_slam doctor: ")
+
+
+@pytest.fixture(scope="module")
+def two_lasers():
+    """The records of 70 s of a robot with a front and a rear laser."""
+    return list(open_log(TWO_LASERS, duration=70.0).records())
+
+
+def move_rear_laser(drive, offset):
+    """The stated mounting of the rear laser is off."""
+
+    def state(scan):
+        is_rear = abs(scan.laser_pose[2]) > 1.0
+        return replace(scan, laser_pose=se2.compose(scan.laser_pose, np.array(offset))) if is_rear else scan
+
+    return change_records(drive, scan=state)
+
+
+def test_two_lasers_at_their_mountings_see_the_same_surfaces(two_lasers):
+    assert subjects(Faulty(two_lasers)) == {}
+    names = "The laser at (-0.20 m, 0.00 m, 180 degrees) and the laser at (0.20 m, 0.00 m, 0 degrees) see the same"
+    assert text_of(Faulty(two_lasers), "two lasers") == f"{names} surfaces in the same places."
+    rates = [one.text for one in log_findings(Faulty(two_lasers)) if one.subject == "contents"]
+    assert [" scans at 5.0 Hz" in text for text in rates] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("offset", "severity", "sentence"),
+    [
+        ((0.0, 0.3, 0.0), "wrong", "0.30 m and 0.1 degrees apart"),
+        ((0.0, 0.0, math.radians(4.0)), "doubtful", "0.04 m and 3.8 degrees apart"),
+        ((0.0, 0.0, math.radians(12.0)), "wrong", "degrees apart: measure their mountings anew"),
+    ],
+)
+def test_two_lasers_one_of_which_is_elsewhere_contradict_each_other(two_lasers, offset, severity, sentence):
+    log = move_rear_laser(two_lasers, offset)
+    assert subjects(log)["two lasers"] == severity
+    assert sentence in text_of(log, "two lasers")
+    assert re.search(r"the first one is at \(-0\.2\d m, -?0\.0\d m, -?1(80|79) degrees\)", text_of(log, "two lasers"))
+
+
+def test_a_laser_that_sees_the_robot_is_named_among_two(two_lasers):
+    def block(scan):
+        return replace(scan, ranges=with_body(scan.ranges)) if abs(scan.laser_pose[2]) > 1.0 else scan
+
+    def with_body(ranges):
+        return np.where(np.arange(ranges.size) < 20, np.float32(0.3), ranges)
+
+    text = text_of(change_records(two_lasers, scan=block), "beams on the robot")
+    assert text.startswith("Of the laser at (-0.20 m, 0.00 m, 180 degrees): 20 beams, from number 0 to 19")

@@ -153,8 +153,8 @@ def test_the_only_topic_of_its_type_serves_where_the_default_is_missing(tmp_path
     ("topics", "wanted", "sentence"),
     [
         (["/a", "/b"], {}, "has no topic /scan: choose one of /a, /b"),
-        (["/a"], {"scan_topic": "/front"}, "has no topic /front: choose one of /a"),
-        (["/scan"], {"scan_topic": "/odom"}, "topic /odom of bag is of type nav_msgs/msg/Odometry"),
+        (["/a"], {"scan_topics": "/front"}, "has no topic /front: choose one of /a"),
+        (["/scan"], {"scan_topics": "/odom"}, "topic /odom of bag is of type nav_msgs/msg/Odometry"),
         ([], {}, "has no topic of type sensor_msgs/msg/LaserScan"),
         (["/scan"], {"odom_topic": "/wheels"}, "has no topic /wheels: choose one of /odom"),
     ],

@@ -14,8 +14,9 @@ from urllib.request import urlopen
 import numpy as np
 import preloaded
 import pytest
-from logs_for_nodes import corridor_bag, is_alive
+from logs_for_nodes import Corridor, corridor_bag, is_alive
 from preloaded import hmt_slam
+from two_lasers import TOPICS, bag_with_two_topics
 
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.errors import HmtSlamError
@@ -116,8 +117,11 @@ def test_the_nodes_take_the_same_decisions_as_the_lock_step_run(folders, name):
     assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
 
 
-def test_the_nodes_correct_scans_for_the_motion_during_their_sweeps_as_the_lock_step_run_does(map_twice, tmp_path):
-    nodes, lock_step = map_twice(corridor_bag(tmp_path, scans=60, sweep=0.15))
+def test_the_nodes_correct_scans_of_two_lasers_for_the_motion_during_their_sweeps_as_the_lock_step_run_does(
+    map_twice, tmp_path
+):
+    log = bag_with_two_topics(Corridor(40, sweep=0.15, has_rear_laser=True), tmp_path)
+    nodes, lock_step = map_twice(log, f"sensors.scan_topics={TOPICS}")
     scans, others = (read_saved_map(folder / "hmt_map").replica.scans for folder in (nodes, lock_step))
     assert {k: scan.motion.tobytes() for k, scan in scans.items()} == {k: s.motion.tobytes() for k, s in others.items()}
     # The log ends within the last sweep.
@@ -126,6 +130,7 @@ def test_the_nodes_correct_scans_for_the_motion_during_their_sweeps_as_the_lock_
     assert len(motions) > 8
     np.testing.assert_allclose(np.hypot(motions[:, 0], motions[:, 1]), 0.075, rtol=1e-3)
     np.testing.assert_allclose(motions[:, 2], 0.006, rtol=1e-3)
+    assert {round(scan.laser_pose[2]) for scan in scans.values()} == {0, 3}
     for name in ("trajectory.tum", "map.pgm", "hmt_map/map.json"):
         assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
 

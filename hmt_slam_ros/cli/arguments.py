@@ -174,8 +174,15 @@ def _add_convert_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("source", type=Path, metavar="SRC", help=_LOG)
     command.add_argument("destination", type=Path, metavar="DST", help="rosbag2 folder to make")
     command.add_argument("--marks", default="", metavar="TOPIC", help="topic of a bag's observations of marks, to keep")
+    _add_scan_topics(command)
     _add_storage(command)
     _add_time_window(command)
+
+
+def _add_scan_topics(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--scans", default="/scan", metavar="TOPICS", help="topics of a bag's scans, separated by commas"
+    )
 
 
 def _add_storage(command: argparse.ArgumentParser) -> None:
@@ -231,6 +238,7 @@ def _add_doctor_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--live", action="store_true", help="listen to the running system instead")
     command.add_argument("--seconds", type=float, default=10.0, metavar="S", help="how long to listen to it")
     command.add_argument("--json", action="store_true", help="print the findings as JSON")
+    _add_scan_topics(command)
     _add_time_window(command)
     command.add_argument(
         "--ros-args",

@@ -21,9 +21,9 @@ SOMETHING_WRONG = 1
 
 def run_convert(options: argparse.Namespace) -> None:
     """Write any log as a rosbag2."""
-    log = open_log(
-        options.source, marks_topic=options.marks, start=options.start or 0.0, duration=options.duration or None
-    )
+    start, duration = options.start or 0.0, options.duration or None
+    topics = {"scan_topics": options.scans, "marks_topic": options.marks}
+    log = open_log(options.source, **topics, start=start, duration=duration)
     report_left_out(log, options.command)
     write_bag(log, options.destination, storage=options.storage)
     print(f"{options.destination}: {log.scan_count} scans, {log.duration:.1f} s")
@@ -49,7 +49,8 @@ def run_doctor(options: argparse.Namespace) -> int:
     if options.live:
         findings = _examine_running_system(options)
     else:
-        findings = examine(options.log, start=options.start or 0.0, duration=options.duration or None)
+        start, duration = options.start or 0.0, options.duration or None
+        findings = examine(options.log, scan_topics=options.scans, start=start, duration=duration)
     print(_as_json(findings) if options.json else _as_text(findings))
     return SOMETHING_WRONG if any(finding.severity == "wrong" for finding in findings) else 0
 

@@ -24,7 +24,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.offline.lock_step import RunResult
 from hmt_slam_ros.offline.run import run_log
-from hmt_slam_ros.open_log import open_log
+from hmt_slam_ros.open_log import open_configured
 from hmt_slam_ros.process_memory import resource_usage
 from hmt_slam_ros.results.final_map import FinalMap, deskewed_scans, final_map
 from hmt_slam_ros.results.hmt_map import RunState, read_run_state, read_saved_map
@@ -80,34 +80,21 @@ def initial_state(options: argparse.Namespace, path: Path, source: Path | None) 
         configuration = chosen_configuration(options)
         if configuration.mode == "localization":
             raise HmtSlamError("mode = localization wants a map to find the robot in: give --from, or map first")
-        return configuration, RunState(), open_time_window(path, configuration)
+        return configuration, RunState(), open_configured(path, configuration)
     folder = map_folder(source)
     state, saved = read_run_state(folder)
     whole = with_changes(saved, {"robot.duration": 0.0})
     configuration = chosen_configuration(options, whole)
-    log = open_time_window(path, configuration)
+    log = open_configured(path, configuration)
     further = not is_newest_log(state.log, log)
     if further:
         state = replace(state, log=replace(state.log, earlier_trajectory=read_saved_map(folder).relative_trajectory))
         configuration = chosen_configuration(options, with_changes(whole, {"robot.start": 0.0}))
-        log = open_time_window(path, configuration)
+        log = open_configured(path, configuration)
     changes = describe_parameter_changes(saved, configuration, further=further)
     for sentence in filter(None, (describe_log(state.log, log.name, further=further), changes)):
         print(f"hmt_slam map: {sentence}", file=sys.stderr)
     return configuration, state, log
-
-
-def open_time_window(path: Path, configuration: Configuration) -> Log:
-    """The part of a log that ``robot.start`` and ``robot.duration`` select."""
-    log = open_log(
-        path,
-        marks_topic=configuration.marks.topic,
-        start=configuration.robot.start,
-        duration=configuration.robot.duration or None,
-    )
-    if not log.scan_count:
-        raise HmtSlamError(f"{path} has no scans in the part asked for: check --start and --duration")
-    return log
 
 
 def run_measured(
@@ -168,12 +155,7 @@ def run_replay(options: argparse.Namespace) -> None:
     check_single_log(options)
     configuration = chosen_configuration(options)
     check_output(options.out, options.command)
-    log = open_log(
-        options.log,
-        marks_topic=configuration.marks.topic,
-        start=configuration.robot.start,
-        duration=configuration.robot.duration or None,
-    )
+    log = open_configured(options.log, configuration)
     report_left_out(log, options.command)
     replay = load_replay().replay
     announce_page(options.view)

@@ -15,7 +15,6 @@ from hmt_slam_ros.cli.run_commands import (
     finish_measured,
     initial_state,
     load_replay,
-    open_time_window,
 )
 from hmt_slam_ros.cli.terminal import Progress, report_left_out, summary
 from hmt_slam_ros.configuration import Configuration
@@ -23,6 +22,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.records import Log
 from hmt_slam_ros.messages.team import TeamPlacement
 from hmt_slam_ros.offline.team_run import TeamRun
+from hmt_slam_ros.open_log import open_configured
 from hmt_slam_ros.results.hmt_map import RunState
 from hmt_slam_ros.results.merged_map import describe_meeting, read_team, write_merged
 from hmt_slam_ros.results.output_folder import atomic_output, map_writer, robot_folder, robot_folders, write_output
@@ -76,7 +76,7 @@ def run_team_replay(options: argparse.Namespace) -> None:
     logs = {robot_folder(n): path for n, path in enumerate(paths, 1)}
     replay = load_replay("team_replay").replay_team
     check_output(options.out, options.command)
-    opened = {name: open_time_window(path, configuration) for name, path in logs.items()}
+    opened = {name: open_configured(path, configuration) for name, path in logs.items()}
     for log in opened.values():
         report_left_out(log, options.command)
     announce_page(options.view, len(logs))

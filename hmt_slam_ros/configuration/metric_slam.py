@@ -8,6 +8,25 @@ from hmt_slam_ros.configuration.parameter import parameter
 
 
 @dataclass(frozen=True)
+class SensorParameters:
+    """Sensors of the robot."""
+
+    scan_topics: str = parameter(
+        "scan", "Topics of the scans, separated by commas; each may have several lasers, in frames of their own."
+    )
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The topics of the scans."""
+        return split_topics(self.scan_topics)
+
+
+def split_topics(text: str) -> tuple[str, ...]:
+    """Names of topics that are separated by commas, each once."""
+    return tuple(dict.fromkeys(name for name in map(str.strip, text.split(",")) if name))
+
+
+@dataclass(frozen=True)
 class MotionParameters:
     """Odometry motion model: noise of the increment between two readings."""
 

@@ -7,6 +7,7 @@ converts it. After a change run ``scripts/generate_docs.py``.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -17,6 +18,7 @@ from hmt_slam_ros.configuration.metric_slam import (
     LocalMapParameters,
     MatchingParameters,
     MotionParameters,
+    SensorParameters,
 )
 from hmt_slam_ros.configuration.parameter import parameter
 from hmt_slam_ros.configuration.robot import ExplorerParameters, PilotParameters, RealTimeParameters, RobotParameters
@@ -44,6 +46,7 @@ class Configuration:
         "Whether the map grows, stays as it was loaded, or follows a world that changes (lifelong).",
         choices=("mapping", "localization", "lifelong"),
     )
+    sensors: SensorParameters = field(default_factory=SensorParameters)
     motion: MotionParameters = field(default_factory=MotionParameters)
     local_map: LocalMapParameters = field(default_factory=LocalMapParameters)
     matching: MatchingParameters = field(default_factory=MatchingParameters)
@@ -73,7 +76,17 @@ class ConsistencyRule(NamedTuple):
     advice: str
 
 
+_MAX_TOPICS = 8
+"""Topics of scans."""
+
+_TOPIC = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
+"""Name of a topic, relative or absolute."""
+
 CONSISTENCY_RULES: tuple[ConsistencyRule, ...] = (
+    ConsistencyRule(
+        lambda tree: 1 <= len(tree.sensors.topics) <= _MAX_TOPICS and all(map(_TOPIC.fullmatch, tree.sensors.topics)),
+        f"sensors.scan_topics does not name 1 to {_MAX_TOPICS} topics; give such as scan, or scan_front,scan_rear",
+    ),
     ConsistencyRule(
         lambda tree: tree.local_map.field_radius >= 2.0 * tree.local_map.cell,
         "local_map.field_radius has to be at least two cells; raise it or make local_map.cell smaller",

@@ -19,7 +19,7 @@ from hmt_slam_ros.logs.bag import (
     DEFAULT_ODOM_TOPIC,
     DEFAULT_SCAN_TOPIC,
     choose_odom_topic,
-    choose_scan_topic,
+    choose_scan_topics,
     read_header,
 )
 from hmt_slam_ros.logs.bag_files import count_messages, read_messages, read_topics
@@ -116,15 +116,16 @@ class TransformCollector:
             self._max_changes[key] = max(self._max_changes.get(key, 0.0), float(np.abs(transform - first).max()))
 
 
-def read_message_statistics(path: Path) -> MessageStatistics:
+def read_message_statistics(path: Path, scan_topics: str = DEFAULT_SCAN_TOPIC) -> MessageStatistics:
     """The statistics of the messages of a bag.
 
+    :param scan_topics: topics of the scans, separated by commas.
     :raises HmtSlamError: where the bag is damaged.
     """
     types = read_topics(path)
-    scan_topic = choose_scan_topic(types, DEFAULT_SCAN_TOPIC, path.name)
+    scans = set(choose_scan_topics(types, scan_topics, path.name))
     odom_topic = choose_odom_topic(types, DEFAULT_ODOM_TOPIC, path.name)
-    headers = Counter(read_scan_header(message.content) for message in read_messages(path, {scan_topic}))
+    headers = Counter(read_scan_header(message.content) for message in read_messages(path, scans))
     collector = TransformCollector()
     for topic in ("/tf_static", "/tf"):
         for message in read_messages(path, {topic}):

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -18,7 +20,6 @@ from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.configuration.topology import RefinementParameters
 from hmt_slam_ros.doctor.frames import MessageStatistics
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.logs import Log
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.registration.scan_to_scan import Weighting, extract_surfaces, normal_equations
 from hmt_slam_ros.sensors import Odometry, Scan
@@ -187,10 +188,60 @@ def seconds_between(stamps: Int64) -> Float64:
     return np.diff(stamps) * 1e-9
 
 
-class _Pair(NamedTuple):
+class ScanPair(NamedTuple):
+    """Two scans, and a guess of the robot's motion between them, ``start_T_end``, shape (3,)."""
+
     start: Scan
     end: Scan
-    guess: float
+    guess: Float64
+
+
+MAX_LASERS = 8
+"""Lasers of a robot that are distinguished."""
+
+_PAIR_INTERVAL, _PAIR_AGES = 400_000_000, (0, 3, 6)
+"""Least time between two scans of a laser that are paired, ns; and which of the last of them are paired with a scan."""
+
+_MAX_PAIRS = 1000
+"""Pairs of scans of different lasers, which take two seconds."""
+
+
+class _PlacedScan(NamedTuple):
+    """A scan, and the pose of the robot by the last odometry before it, ``odom_T_base``, shape (3,)."""
+
+    scan: Scan
+    pose: Float64
+
+
+class LaserPairs:
+    """Pairs of scans of different lasers from a few seconds, in which both may see the same surfaces.
+
+    :ivar pairs: the pairs, guessed by odometry; the first is the earlier one.
+    """
+
+    def __init__(self) -> None:
+        self.pairs: list[ScanPair] = []
+        self._recent: dict[bytes, deque[_PlacedScan]] = {}
+        self._pose: Float64 | None = None
+
+    def note_odometry(self, reading: Odometry) -> None:
+        """Take note of the newest reading."""
+        self._pose = reading.pose
+
+    def add_scan(self, scan: Scan) -> None:
+        """Pair a scan with some of the last scans of the other lasers."""
+        key = scan.laser_pose.tobytes()
+        if self._pose is None or (key not in self._recent and len(self._recent) == MAX_LASERS):
+            return
+        own = self._recent.setdefault(key, deque(maxlen=_PAIR_AGES[-1] + 1))
+        if own and 0 < scan.stamp - own[-1].scan.stamp < _PAIR_INTERVAL:
+            return
+        own.append(_PlacedScan(scan, self._pose))
+        for recent in self._recent.values():
+            for age in _PAIR_AGES if recent is not own else ():
+                if age < len(recent) and len(self.pairs) < _MAX_PAIRS:
+                    earlier = recent[-1 - age]
+                    self.pairs.append(ScanPair(earlier.scan, scan, se2.between(earlier.pose, self._pose)))
 
 
 class ScanMotionFinder:
@@ -198,7 +249,7 @@ class ScanMotionFinder:
 
     def __init__(self) -> None:
         self._last: Scan | None = None
-        self._pairs: list[_Pair] = []
+        self._pairs: list[ScanPair] = []
         self._motions: list[ScanMotions] = []
 
     def add(self, scan: Scan) -> None:
@@ -209,7 +260,7 @@ class ScanMotionFinder:
         self._last = scan
         if last is None:
             return
-        self._pairs.append(_Pair(last, scan, turn_between(last, scan)))
+        self._pairs.append(ScanPair(last, scan, np.array([0.0, 0.0, turn_between(last, scan)])))
         if len(self._pairs) == _BATCH:
             self._register()
 
@@ -224,26 +275,28 @@ class ScanMotionFinder:
 
     def _register(self) -> None:
         pairs, self._pairs = self._pairs, []
-        if not pairs:
-            return
-        scans = [pairs[0].start, *(pair.end for pair in pairs)]
-        surfaces = extract_surfaces(scans, _MAX_RANGE, _MAX_POINTS)
-        starts, ends = np.arange(len(pairs)), np.arange(1, len(pairs) + 1)
-        options = RefinementParameters()
-        guess = np.zeros((len(pairs), 3))
-        guess[:, 2] = [pair.guess for pair in pairs]
-        motions = guess
-        for gate in _GATES:
-            weights = Weighting(options.sigma, max(options.robust_scale, 0.3 * gate), 1.0)
-            information, gradient, matched = normal_equations(
-                surfaces, ends, surfaces, starts, motions, gate, weights, 1
-            )
-            slope = gradient + se2.log(se2.between(guess, motions)) @ _WEAK_PRIOR
-            step = np.linalg.solve(information + _WEAK_PRIOR, slope[..., None])[..., 0]
-            motions = se2.compose(motions, se2.exp(-np.clip(step, -1.0, 1.0)))
-        matched[np.diff(surfaces.starts)[1:] < _MIN_POINTS] = 0.0
-        stamps = np.array([scan.stamp for scan in scans])
-        self._motions.append(ScanMotions(stamps[:-1], stamps[1:], motions, information, matched))
+        if pairs:
+            self._motions.append(register_pairs(pairs))
+
+
+def register_pairs(pairs: Sequence[ScanPair]) -> ScanMotions:
+    """The motions between pairs of scans, each near its guess."""
+    scans = list({id(scan): scan for pair in pairs for scan in (pair.start, pair.end)}.values())
+    numbers = {id(scan): number for number, scan in enumerate(scans)}
+    surfaces = extract_surfaces(scans, _MAX_RANGE, _MAX_POINTS)
+    starts, ends = (np.array([numbers[id(pair[side])] for pair in pairs]) for side in (0, 1))
+    options = RefinementParameters()
+    guess = np.array([pair.guess for pair in pairs])
+    motions = guess
+    for gate in _GATES:
+        weights = Weighting(options.sigma, max(options.robust_scale, 0.3 * gate), 1.0)
+        information, gradient, matched = normal_equations(surfaces, ends, surfaces, starts, motions, gate, weights, 1)
+        slope = gradient + se2.log(se2.between(guess, motions)) @ _WEAK_PRIOR
+        step = np.linalg.solve(information + _WEAK_PRIOR, slope[..., None])[..., 0]
+        motions = se2.compose(motions, se2.exp(-np.clip(step, -1.0, 1.0)))
+    matched[np.diff(surfaces.starts)[ends] < _MIN_POINTS] = 0.0
+    stamps = np.array([scan.stamp for scan in scans])
+    return ScanMotions(stamps[starts], stamps[ends], motions, information, matched)
 
 
 def turn_between(start: Scan, end: Scan) -> float:
@@ -283,22 +336,27 @@ def _best_shift(start: Float32, end: Float32, shift: int, steps: int, every: int
 
 
 class Gatherer:
-    """Gathers the statistics of records, which are added one after the other."""
+    """Gathers the statistics of records, which are added one after the other, for each laser."""
 
     def __init__(self) -> None:
-        self._scan_stamps, self._odometry_stamps = array("q"), array("q")
-        self._scan_rows, self._odometry_rows = array("d"), array("d")
-        self._counts, self._non_finite_count = array("q"), 0
-        self._beam_statistics = BeamStatistics(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
-        self._sweep_check, self._sweep_fault_count, self._first_sweep_fault = SweepCheck(), 0, ""
-        self._motions = ScanMotionFinder()
+        self._odometry_stamps, self._odometry_rows, self._non_finite_count = array("q"), array("d"), 0
+        self._lasers: dict[bytes, _LaserGatherer] = {}
+        self._pairs = LaserPairs()
 
     def add(self, record: LogRecord) -> None:
         """Add a scan or an odometry reading; observations of marks are passed over."""
         if isinstance(record.measurement, Scan):
-            self._add_scan(record.source_stamp, record.measurement)
+            self._laser_of(record.measurement).add(record.source_stamp, record.measurement)
+            self._pairs.add_scan(record.measurement)
         elif isinstance(record.measurement, Odometry):
             self._add_odometry(record.source_stamp, record.measurement)
+
+    def _laser_of(self, scan: Scan) -> _LaserGatherer:
+        """Where the scans of a laser are gathered; a laser in more places is one that moves."""
+        key = scan.laser_pose.tobytes()
+        if key not in self._lasers and len(self._lasers) == MAX_LASERS:
+            key = next(iter(self._lasers))
+        return self._lasers.setdefault(key, _LaserGatherer())
 
     def _add_odometry(self, source_stamp: int, reading: Odometry) -> None:
         if not np.isfinite(reading.pose).all():
@@ -306,8 +364,37 @@ class Gatherer:
             return
         self._odometry_stamps.extend((source_stamp, reading.stamp))
         self._odometry_rows.extend(reading.pose)
+        self._pairs.note_odometry(reading)
 
-    def _add_scan(self, source_stamp: int, scan: Scan) -> None:
+    def finish(self, name: str, messages: MessageStatistics | None = None) -> tuple[Statistics, ...]:
+        """The statistics of all records, for each laser.
+
+        :param name: name of the log.
+        :param messages: statistics of its messages, None where it is no bag.
+        """
+        stamps = np.array(self._odometry_stamps, np.int64).reshape(-1, 2)
+        poses = np.array(self._odometry_rows, np.float64).reshape(-1, 3)
+        odometry = OdometryStatistics(stamps[:, 0], stamps[:, 1], poses, self._non_finite_count)
+        lasers = self._lasers.values() or [_LaserGatherer()]
+        return tuple(Statistics(name, laser.scans(), odometry, laser.motions(), messages) for laser in lasers)
+
+    @property
+    def laser_pairs(self) -> LaserPairs:
+        """Pairs of scans of different lasers."""
+        return self._pairs
+
+
+class _LaserGatherer:
+    """Gathers the statistics of the scans of a laser."""
+
+    def __init__(self) -> None:
+        self._scan_stamps, self._scan_rows, self._counts = array("q"), array("d"), array("q")
+        self._beam_statistics = BeamStatistics(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
+        self._sweep_check, self._sweep_fault_count, self._first_sweep_fault = SweepCheck(), 0, ""
+        self._motions = ScanMotionFinder()
+
+    def add(self, source_stamp: int, scan: Scan) -> None:
+        """Add a scan."""
         if not self._scan_stamps:
             size = scan.ranges.size
             self._beam_statistics = BeamStatistics(np.zeros(size, np.int64), np.full(size, np.inf), np.zeros(size))
@@ -322,16 +409,12 @@ class Gatherer:
         self._first_sweep_fault = self._first_sweep_fault or fault or ""
         self._motions.add(scan)
 
-    def finish(self, name: str, messages: MessageStatistics | None = None) -> Statistics:
-        """The statistics of all records.
-
-        :param name: name of the log.
-        :param messages: statistics of its messages, None where it is no bag.
-        """
+    def scans(self) -> ScanStatistics:
+        """The statistics of the scans."""
         stamps = np.array(self._scan_stamps, np.int64).reshape(-1, 2)
         rows = np.array(self._scan_rows, np.float64).reshape(-1, 8)
         counts = BeamCounts(*np.array(self._counts, np.int64).reshape(-1, 6).T)
-        scans = ScanStatistics(
+        return ScanStatistics(
             stamps[:, 0],
             stamps[:, 1],
             rows[:, :5],
@@ -341,21 +424,10 @@ class Gatherer:
             self._sweep_fault_count,
             self._first_sweep_fault,
         )
-        stamps = np.array(self._odometry_stamps, np.int64).reshape(-1, 2)
-        poses = np.array(self._odometry_rows, np.float64).reshape(-1, 3)
-        odometry = OdometryStatistics(stamps[:, 0], stamps[:, 1], poses, self._non_finite_count)
-        return Statistics(name, scans, odometry, self._motions.finish(), messages)
 
-
-def gather(log: Log, messages: MessageStatistics | None = None) -> Statistics:
-    """The statistics of a log.
-
-    :param messages: statistics of its messages, None where it is no bag.
-    """
-    gatherer = Gatherer()
-    for record in log.records():
-        gatherer.add(record)
-    return gatherer.finish(log.name, messages)
+    def motions(self) -> ScanMotions:
+        """The robot's motions by the scans."""
+        return self._motions.finish()
 
 
 @njit(cache=True)

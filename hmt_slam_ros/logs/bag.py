@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.configuration.metric_slam import split_topics
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.bag_files import BagMessage, check_bag, read_messages, read_topics
 from hmt_slam_ros.logs.mark_messages import mark_from_message
@@ -61,22 +62,23 @@ def read_header(content: bytes) -> Header:
     return Header(seconds * NANOSECONDS + nanoseconds, content[16 : 15 + length].decode())
 
 
-def choose_scan_topic(topics: Mapping[str, str], wanted: str, name: str) -> str:
-    """The topic of the scans: the wanted one, or the only one of its type where the default is missing.
+def choose_scan_topics(topics: Mapping[str, str], wanted: str, name: str) -> tuple[str, ...]:
+    """The topics of the scans: the wanted ones, or the only one of its type where the default is missing.
 
     :param topics: {topic: message type}.
-    :param wanted: topic that the user wants.
+    :param wanted: topics that the user wants, separated by commas; without a slash they are in the root namespace.
     :param name: name of the bag, for error messages.
     :raises HmtSlamError: where there is none, or more than one to choose from.
     """
-    found = _choose_topic(topics, wanted, DEFAULT_SCAN_TOPIC, LASER_SCAN, name)
-    if found is None:
+    names = dict.fromkeys(f"/{topic.lstrip('/')}" for topic in split_topics(wanted))
+    found = [_choose_topic(topics, topic, DEFAULT_SCAN_TOPIC, LASER_SCAN, name) for topic in names]
+    if None in found:
         raise HmtSlamError(f"{name} has no topic of type {LASER_SCAN}: record the laser's scans in it.")
-    return found
+    return tuple(topic for topic in found if topic is not None)
 
 
 def choose_odom_topic(topics: Mapping[str, str], wanted: str, name: str) -> str | None:
-    """The topic of the odometry, as in `choose_scan_topic`; None where only /tf has odometry.
+    """The topic of the odometry, as in `choose_scan_topics`; None where only /tf has odometry.
 
     :raises HmtSlamError: where there is neither, or more than one to choose from.
     """
@@ -152,19 +154,22 @@ class BagLog:
 
     :param path: a bag folder, or a .mcap or .db3 file.
     :param window: part of the log to read.
-    :param scan_topic: topic of the scans; the only LaserScan topic where the default does not exist.
+    :param scan_topics: topics of the scans, separated by commas; the only LaserScan topic where the default does not
+        exist.
     :param odom_topic: topic of the odometry, chosen likewise; without any, the transform odom -> base on /tf.
     :param marks_topic: topic of the observations of marks, empty for none.
     :raises HmtSlamError: where the bag is truncated or damaged, or lacks scans, odometry, marks or a laser's transform.
     """
 
-    def __init__(self, path: Path, window: TimeWindow, scan_topic: str, odom_topic: str, marks_topic: str = "") -> None:
+    def __init__(
+        self, path: Path, window: TimeWindow, scan_topics: str, odom_topic: str, marks_topic: str = ""
+    ) -> None:
         check_bag(path)
         self._path = path
         self.left_out = LeftOut()
         self.name = path.stem if path.is_file() else path.name
         topics = read_topics(path)
-        self._scan_topic = choose_scan_topic(topics, scan_topic, path.name)
+        self._scan_topics = choose_scan_topics(topics, scan_topics, path.name)
         self._odom_topic = choose_odom_topic(topics, odom_topic, path.name)
         self._base_frame = self._find_base_frame()
         self._kept: list[bool] = []
@@ -264,7 +269,7 @@ class BagLog:
         check_odometry(Odometry(stamp, _pose_from_parts(position, rotation)))
 
     def _read_measurements(self) -> Iterator[_Measurement]:
-        for message in read_messages(self._path, {self._scan_topic, self._odom_topic or "/tf"}):
+        for message in read_messages(self._path, {*self._scan_topics, self._odom_topic or "/tf"}):
             if message.kind == TRANSFORMS:
                 yield from self._odometry_transforms(message)
             elif message.kind == LASER_SCAN:

@@ -28,7 +28,7 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
 from hmt_slam_ros.doctor import running
-from hmt_slam_ros.doctor.examination import statistics_findings
+from hmt_slam_ros.doctor.examination import gathered_findings
 from hmt_slam_ros.doctor.finding import Finding, sorted_findings
 from hmt_slam_ros.doctor.frames import MessageStatistics, ScanHeader, TransformCollector
 from hmt_slam_ros.doctor.running import FrameContradiction, Mismatch, NodeStatus, RunningSystem, Topic
@@ -157,7 +157,7 @@ class DoctorNode(Node):
         found = list(running.running_findings(system))
         if not system.topics[running.SCAN].message_count:
             return found
-        return [*found, *statistics_findings(self._gather().finish("the running system", self._message_statistics()))]
+        return [*found, *gathered_findings(self._gather(), "the running system", self._message_statistics())]
 
     def _on_scan(self, message: LaserScan) -> None:
         self._count_message(running.SCAN, conversions.stamp_from_time(message.header.stamp))

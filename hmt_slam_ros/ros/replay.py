@@ -24,7 +24,7 @@ from hmt_slam_ros.configuration.documents import ros_yaml, yaml_value
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs import Log
 from hmt_slam_ros.messages.team import TeamPlacement
-from hmt_slam_ros.open_log import is_simulated, open_log
+from hmt_slam_ros.open_log import is_simulated, open_configured
 from hmt_slam_ros.process_memory import ResourceUsage
 from hmt_slam_ros.process_table import COORDINATOR, TEAM, consumer_count, process_names
 from hmt_slam_ros.results.final_map import deskewed_scans, final_map
@@ -33,7 +33,7 @@ from hmt_slam_ros.results.recorder import Recording
 from hmt_slam_ros.ros.execution import wait_until_alone
 from hmt_slam_ros.ros.node_processes import NodeProcesses, own_domain
 from hmt_slam_ros.ros.recorder_node import RecorderNode
-from hmt_slam_ros.ros.topics import TFMessage
+from hmt_slam_ros.ros.topics import SCAN, TFMessage
 from hmt_slam_ros.sensors import Scan
 
 STALL_TIMEOUT = 180.0
@@ -166,14 +166,7 @@ class ReplayRun:
             raise HmtSlamError("robot.drive = commands is for the robot node alone: set it to log for a replay")
         if configuration.robot.loop:
             raise HmtSlamError("robot.loop = true has no end to wait for: set it to false for a replay into a folder")
-        self._opened = open_log(
-            log,
-            marks_topic=configuration.marks.topic,
-            start=configuration.robot.start,
-            duration=configuration.robot.duration or None,
-        )
-        if not self._opened.scan_count:
-            raise HmtSlamError(f"{log} has no scans in the part asked for: check --start and --duration")
+        self._opened = open_configured(log, configuration)
         self._log, self._contents = log, _read_contents(self._opened)
         self._configuration, self._progress = configuration, progress or (lambda _: None)
         self._stall_timeout, self._view_port = stall_timeout, view_port
@@ -249,7 +242,9 @@ class ReplayRun:
             children.start("view", ["-p", f"port:={self._view_port}", *system], environment)
         shared = ["--params-file", str(parameters), *system]
         recovery = ["-p", f"recovery:={scratch / 'recovery'}"]
-        own = {COORDINATOR: _slam_arguments(self._contents.laser_poses)}
+        # The robot node publishes the scans of all lasers on one topic, in their order in the log.
+        one_topic = ["-p", f"sensors.scan_topics:={SCAN}"]
+        own = {COORDINATOR: [*_slam_arguments(self._contents.laser_poses), *one_topic]}
         for name in self._nodes:
             children.start(name, shared + recovery + own.get(name, []), environment)
         values = {

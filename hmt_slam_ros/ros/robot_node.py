@@ -36,7 +36,7 @@ from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.logs.writer import WORLD_FRAME
 from hmt_slam_ros.messages.documents import RobotStatus, encode
 from hmt_slam_ros.messages.messages import LocalEstimate, Message, TrackingReset
-from hmt_slam_ros.open_log import is_simulated, open_log
+from hmt_slam_ros.open_log import is_simulated, open_configured
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.chain_writer import publish_reliably
 from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, KERNELS, LOADING, NodeDiagnostics, is_of_other_namespace
@@ -197,15 +197,7 @@ class RobotNode(ConfiguredNode):
         if self._settings.drive == "commands":
             self._driven_robot = DrivenRobotSource(self, path, self._settings)
             return self._driven_robot
-        log = open_log(
-            Path(path),
-            marks_topic=self.configuration.marks.topic,
-            start=self._settings.start,
-            duration=self._settings.duration or None,
-        )
-        if not log.scan_count:
-            raise HmtSlamError(f"{path} has no scans in the part asked for: check robot.start and robot.duration")
-        return log
+        return open_configured(Path(path), self.configuration)
 
     def on_configuration_changed(self, configuration: Configuration) -> None:
         """Apply another rate or flow control."""

@@ -204,7 +204,7 @@ def clearance(walls: Float64, points: Float64) -> Float64:
 
 
 class Laser:
-    """A planar range finder that faces ahead.
+    """A planar range finder that faces ahead or back.
 
     :ivar pose: shape (3,), ``base_T_laser``, m and rad.
     :ivar angles: shape (n,), of the beams, rad.
@@ -213,8 +213,9 @@ class Laser:
     :ivar times: shape (n,), of each beam after the first, s; shape (1,) without time between them.
     """
 
-    def __init__(self, settings: Settings) -> None:
-        self.pose = np.array([settings.forward, 0.0, 0.0])
+    def __init__(self, settings: Settings, *, faces_back: bool = False) -> None:
+        self.pose = np.array([-settings.forward, 0.0, math.pi] if faces_back else [settings.forward, 0.0, 0.0])
+        self._noise = Purpose.REAR_LASER if faces_back else Purpose.LASER
         self.times = np.linspace(0.0, settings.sweep, settings.beams if settings.sweep > 0.0 else 1)
         self._settings = settings
         self.reach = settings.range
@@ -246,7 +247,7 @@ class Laser:
         :param number: of the scan, which determines its noise.
         """
         settings = self._settings
-        draw = random_stream(settings.run_seed, Purpose.LASER, number)
+        draw = random_stream(settings.run_seed, self._noise, number)
         ranges = distances + settings.range_noise * draw.standard_normal(distances.size)
         lost = (draw.random(distances.size) < settings.dropout) | (ranges >= settings.range)
         kept = np.where(lost, np.inf, np.maximum(ranges, 0.0))

@@ -101,7 +101,8 @@ class Scenario:
     :ivar settings: of the drive.
     :ivar building: at the start of this visit.
     :ivar drive: of the robot, without a kidnapping.
-    :ivar laser: of the robot.
+    :ivar laser: of the robot, the first one.
+    :ivar rear_laser: the second one, None where there is one.
     :ivar people: in the building.
     :ivar marks: on its ceiling.
     :ivar walls: of the building with its closed doors, without furniture.
@@ -125,6 +126,7 @@ class Scenario:
         self.drive: Drive = drive_along(path, settings.speed, math.radians(settings.turn_rate))
         _check_effort(self.drive, building, settings)
         self.laser = Laser(settings)
+        self.rear_laser = Laser(settings, faces_back=True) if settings.lasers > 1 else None
         self.walls: WallIndex = wall_index(building.walls)
         self._furniture_schedule = schedule_furniture(building, self.walls, self.drive, settings)
         self._check_clearance()
@@ -168,10 +170,22 @@ class Scenario:
 
     def distances(self, number: int) -> NDArray[np.float64]:
         """True distances along the beams of a scan, shape (n,), m; inf for nothing within reach."""
-        seconds = float(self._seconds(self.scan_stamps[number : number + 1])[0])
-        poses = self._executed_drive.poses(seconds + self.laser.times)
+        return self._distances_of(self.laser, int(self.scan_stamps[number]))
+
+    def rear_scan(self, number: int, stamp: int) -> Scan:
+        """A scan of the rear laser.
+
+        :param stamp: ns.
+        """
+        assert self.rear_laser is not None
+        return self.rear_laser.scan(number, stamp, self._distances_of(self.rear_laser, stamp))
+
+    def _distances_of(self, laser: Laser, stamp: int) -> NDArray[np.float64]:
+        """True distances along the beams of a laser, shape (n,), m; inf for nothing within reach."""
+        seconds = float(self._seconds(np.array([stamp]))[0])
+        poses = self._executed_drive.poses(seconds + laser.times)
         epoch = int(np.searchsorted(self._furniture_schedule.times, seconds, side="right")) - 1
-        return self.laser.distances(poses, self._wall_indices[epoch], self.people.discs_at(seconds, poses[0]))
+        return laser.distances(poses, self._wall_indices[epoch], self.people.discs_at(seconds, poses[0]))
 
     def furniture(self, stamp: int) -> NDArray[np.float64]:
         """The furniture at a stamp, ns, (m, 5) as in `Building`."""

@@ -51,6 +51,12 @@ class Settings:
         0.0, "Time from the first beam to the last, during which the robot moves.", unit="s", low=0.0, high=1.0
     )
     forward: float = parameter(0.0, "Distance of the laser before the robot's middle.", unit="m", low=-2.0, high=2.0)
+    lasers: int = parameter(
+        1,
+        "Lasers; the second is as far behind the robot's middle, faces back, and scans half a period later.",
+        low=1,
+        high=2,
+    )
     people: int = parameter(0, "People who walk to and fro on the robot's route.", low=0, high=200)
     moved: float = parameter(
         0.0, "Probability that a piece of furniture is moved while the robot does not see it.", low=0.0, high=1.0

@@ -25,6 +25,9 @@ from hmt_slam_ros.simulation.worlds import FAMILIES, read_world
 _SHORT_OF_WALL = 0.01
 """Distance before a point on a wall at which its line of sight ends, m."""
 
+_STAMP_STEP = 1_000
+"""Time between the stamps of two scans at one time, ns."""
+
 _SLACK = 1e-9
 """Tolerance of the field of view, which includes the outermost beams, rad."""
 
@@ -107,7 +110,10 @@ class SimulatedLog:
         self.name, self.scenario = name, scenario
         self._part = window.select(scenario.stamps)
         rows = np.arange(scenario.stamps.size)[self._part]
-        self.scan_count = int((rows % scenario.settings.readings == 0).sum())
+        between = rows % scenario.settings.readings
+        self.scan_count = int((between == 0).sum())
+        if scenario.rear_laser is not None:
+            self.scan_count += int((between == scenario.settings.readings // 2).sum())
         require_scans(name, self.scan_count, scenario.stamps.size)
         self.duration = float(scenario.stamps[rows[-1]] - scenario.stamps[rows[0]]) / NANOSECONDS
 
@@ -140,6 +146,10 @@ class SimulatedLog:
             if not between:
                 yield from (LogRecord(stamp, mark) for mark in scenario.marks.observe(scan, stamp))
                 yield LogRecord(stamp, scenario.scan(scan), truth)
+            if scenario.rear_laser is not None and between == scenario.settings.readings // 2:
+                # Of two scans at one time, the stamp of the second is the next one.
+                own_stamp = stamp if between else stamp + _STAMP_STEP
+                yield LogRecord(own_stamp, scenario.rear_scan(scan, own_stamp), truth)
 
 
 def open_simulated(log: str | Path, window: TimeWindow | None = None) -> SimulatedLog:
