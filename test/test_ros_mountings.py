@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from logs_for_nodes import Corridor
+from logs_for_nodes import LASER, REAR_LASER, Corridor
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -42,14 +42,14 @@ BAD = [
 class Laser:
     """Driver of a robot with slam alone, and what slam reports."""
 
-    def __init__(self, listener, start):
+    def __init__(self, listener, start, *words, topic=SCAN):
         node = listener.node
         self._listener = listener
-        self._scans = node.create_publisher(LaserScan, SCAN, topics.SENSOR)
+        self._scans = node.create_publisher(LaserScan, topic, topics.SENSOR)
         self._odom = node.create_publisher(OdometryMessage, "odom", topics.SENSOR)
         self._static = node.create_publisher(TFMessage, "tf_static", topics.CHAIN_HISTORY)
         self._reports = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
-        self.process = start("slam")
+        self.process = start("slam", *words)
         listener.until(lambda: self._scans.get_subscription_count() and self._odom.get_subscription_count())
         self._measurements = iter(record.measurement for record in Corridor(60).records())
 
@@ -62,6 +62,13 @@ class Laser:
 
     def join(self, *transforms):
         self._static.publish(TFMessage(transforms=list(transforms)))
+
+    def tick(self):
+        """Send the next scan, and the odometry before it; returns slam's last error."""
+        self.drive(1)
+        self._listener.spin(0.3)
+        last = self._reports[-1].status[0]
+        return next((one.value for one in last.values if one.key == "last error"), "")
 
     def value(self, name):
         """A number of slam's diagnostics, 0 where it has none."""
@@ -110,3 +117,22 @@ def test_scans_of_unknown_frames_hold_up_those_of_known_ones_for_a_while_only(li
     laser.join(joint(child="unknown_5"))
     laser.drive(1, frame="unknown_5")
     laser.until("received Scan", 5)
+
+
+def test_scans_of_two_topics_are_those_of_one_robot_and_a_silent_one_is_named(listener, start):
+    poses = f"laser_pose:={[*LASER.tolist(), *REAR_LASER.tolist()]}"
+    laser = Laser(listener, start, "-p", "sensors.scan_topics:=front,rear", "-p", poses, topic="front")
+    rear = listener.node.create_publisher(LaserScan, "rear", topics.SENSOR)
+    listener.until(rear.get_subscription_count)
+    scans = (record.measurement for record in Corridor(3, has_rear_laser=True).records())
+    of_rear = [scan for scan in scans if isinstance(scan, Scan) and scan.laser_pose is REAR_LASER]
+    laser.drive(1)
+    laser.until("received Scan", 1)
+    rear.publish(conversions.scan_message(of_rear[0], ""))
+    listener.spin(0.5)
+    laser.drive(2)
+    rear.publish(conversions.scan_message(of_rear[1], ""))
+    # The last scan of the front laser waits, as the rear one may still send an earlier one.
+    laser.until("received Scan", 4)
+    assert (laser.value("refused on front"), laser.value("refused on rear")) == (0, 0)
+    listener.until(lambda: "rear; meanwhile the pose goes on by the other scans" in laser.tick(), alive=[laser.process])

@@ -1,5 +1,6 @@
 """The configuration tree as ROS parameters."""
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
@@ -13,7 +14,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 
 from hmt_slam_ros.configuration import Configuration, flat_parameters
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.ros.parameters import ConfiguredNode, declare_laser_pose
+from hmt_slam_ros.ros.parameters import ConfiguredNode, declare_laser_poses
 
 
 @pytest.fixture
@@ -169,12 +170,16 @@ def test_an_empty_pose_of_a_parameter_file_is_none(make, tmp_path):
     file = tmp_path / "slam.yaml"
     file.write_text("tested:\n  ros__parameters:\n    laser_pose: []\n")
     node = make("--params-file", str(file))
-    assert declare_laser_pose(node) is None
+    assert declare_laser_poses(node, ["scan"]) == {}
     assert list(node.get_parameter("laser_pose").value) == []
 
 
 def test_a_laser_pose_is_three_numbers(make):
-    assert declare_laser_pose(make()) is None
-    assert declare_laser_pose(make("-p", "laser_pose:=[0.1, 0.0, 1.5]")).tolist() == [0.1, 0.0, 1.5]
+    assert declare_laser_poses(make(), ["scan"]) == {}
+    for topics, numbers in ((["scan"], [0.1, 0.0, 1.5]), (["front", "rear"], [0.2, 0.0, 0.0, -0.2, 0.0, 3.0])):
+        poses = declare_laser_poses(make("-p", f"laser_pose:={numbers}"), topics)
+        assert np.concatenate([poses[topic] for topic in topics]).tolist() == numbers
+    with pytest.raises(HmtSlamError, match=r"laser_pose has 3 numbers, and sensors\.scan_topics names 2"):
+        declare_laser_poses(make("-p", "laser_pose:=[0.1, 0.0, 0.0]"), ["front", "rear"])
     with pytest.raises(HmtSlamError, match="is no pose"):
-        declare_laser_pose(make("-p", "laser_pose:=[0.1, 0.0]"))
+        declare_laser_poses(make("-p", "laser_pose:=[0.1, .nan, 0.0]"), ["scan"])

@@ -80,7 +80,7 @@ def test_a_laser_is_silent_only_where_the_node_could_receive_it(monkeypatch, loo
 
     messages = []
     monkeypatch.setattr(time, "monotonic", lambda: 0.0)
-    watch = SensorMonitor(SimpleNamespace(warn=messages.append))
+    watch = SensorMonitor(SimpleNamespace(warn=messages.append), ["scan"])
     for readings, moment in enumerate(looks, 1):
         monkeypatch.setattr(time, "monotonic", lambda moment=moment: moment)
         watch.check_silence(readings)

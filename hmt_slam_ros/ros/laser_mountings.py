@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -59,22 +59,22 @@ class LaserMountings:
         node: GuardedNode,
         diagnostics: NodeDiagnostics,
         frames: OdometryFrames,
-        fixed_pose: NDArray[np.float64] | None,
+        fixed_poses: Mapping[str, NDArray[np.float64]],
         on_change: Callable[[], None] | None = None,
         on_new_mounting: Callable[[FrameMounting], None] | None = None,
     ) -> None:
         """Subscribe to /tf_static, unless the pose is given.
 
         :param frames: that of the robot may be unknown at first.
-        :param fixed_pose: ``base_T_laser`` (3,) of all lasers, None to take it from transforms.
+        :param fixed_poses: {topic of scans: ``base_T_laser`` (3,)}, empty to take them from transforms.
         :param on_change: called after new transforms.
         :param on_new_mounting: called with each new or changed mounting.
         """
-        self._diagnostics, self._odometry_frames, self._fixed_pose = diagnostics, frames, fixed_pose
+        self._diagnostics, self._odometry_frames, self._fixed_poses = diagnostics, frames, fixed_poses
         self._frames = FrameTree(newest=True)
         self._mountings: dict[str, FrameMounting] = {}
         self._on_change, self._on_new_mounting = on_change, on_new_mounting
-        if self._fixed_pose is None and TFMessage is not None:
+        if not self._fixed_poses and TFMessage is not None:
             node.create_subscription(TFMessage, _TF_STATIC, self._on_transforms, topics.TF_STATIC)
 
     def _on_transforms(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
@@ -147,19 +147,19 @@ class LaserMountings:
     def is_known(self, frame: str) -> bool:
         """Whether the pose of a laser is known; it may be one that cannot be used."""
         return (
-            self._fixed_pose is not None
+            bool(self._fixed_poses)
             or frame in self._mountings
             or self._lookup_transform(self._frames, frame) is not None
         )
 
-    def convert_scan(self, message: LaserScan) -> Scan | None:
+    def convert_scan(self, message: LaserScan, topic: str) -> Scan | None:
         """The scan of a message, None as long as the pose of its laser is unknown.
 
         :raises HmtSlamError: for a tilted laser.
         """
         frame = message.header.frame_id
-        if self._fixed_pose is not None:
-            return scan_from_message(message, self._fixed_pose)
+        if self._fixed_poses:
+            return scan_from_message(message, self._fixed_poses[topic])
         if frame not in self._mountings:
             self._adopt(frame, self._mounting_in(self._frames, frame))
         mounting = self._mountings.get(frame)

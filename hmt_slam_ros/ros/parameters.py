@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -146,14 +146,24 @@ def declare_frame(node: Node, which: str, default: str, note: str = "") -> str:
     return str(node.declare_parameter(f"{which}_frame", default, descriptor).value)
 
 
-def declare_laser_pose(node: Node) -> NDArray[np.float64] | None:
-    """Declare ``laser_pose``, and return ``base_T_laser`` (3,), None where it is empty.
+def declare_laser_poses(node: Node, topics: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """Declare ``laser_pose``, and return {topic: ``base_T_laser`` (3,)}, empty where it is.
 
-    :raises HmtSlamError: for anything but three finite numbers.
+    :param topics: those of the scans; a node that has the first alone takes the first pose.
+    :raises HmtSlamError: for anything but three finite numbers for each topic.
     """
-    return declare_pose(
-        node, "laser_pose", "Pose (x, y, theta) of the laser on the robot in m and rad; empty for that of /tf_static."
+    value = _declare_numbers(
+        node,
+        "laser_pose",
+        "Pose (x, y, theta) of the laser on the robot in m and rad, one after the other for each topic of "
+        "sensors.scan_topics; empty for those of /tf_static.",
     )
+    if value and len(value) != 3 * len(topics):
+        raise HmtSlamError(
+            f"laser_pose has {len(value)} numbers, and sensors.scan_topics names {len(topics)} topics: give x, y in m "
+            "and theta in rad for each"
+        )
+    return {topic: _checked_pose("laser_pose", value[3 * k : 3 * k + 3]) for k, topic in enumerate(topics) if value}
 
 
 def declare_pose(node: Node, name: str, description: str) -> NDArray[np.float64] | None:
@@ -163,6 +173,12 @@ def declare_pose(node: Node, name: str, description: str) -> NDArray[np.float64]
 
     :raises HmtSlamError: for anything but three finite numbers.
     """
+    value = _declare_numbers(node, name, description)
+    return _checked_pose(name, value) if value else None
+
+
+def _declare_numbers(node: Node, name: str, description: str) -> list[float]:
+    """Declare a parameter of numbers, and return them."""
     kind = ParameterType.PARAMETER_DOUBLE_ARRAY
     descriptor = ParameterDescriptor(description=description, type=kind)
     value = node.declare_parameter(name, Parameter.Type.DOUBLE_ARRAY, descriptor).value
@@ -171,9 +187,15 @@ def declare_pose(node: Node, name: str, description: str) -> NDArray[np.float64]
         value = []
         node.set_parameters([Parameter(name, Parameter.Type.DOUBLE_ARRAY, value)])
     node.set_descriptor(name, ParameterDescriptor(description=description, type=kind, read_only=True))
-    if len(value) == 0:
-        return None
+    return [float(number) for number in value]
+
+
+def _checked_pose(name: str, value: list[float]) -> NDArray[np.float64]:
+    """The pose of some numbers, shape (3,).
+
+    :raises HmtSlamError: for anything but three finite numbers.
+    """
     pose = np.array(value, dtype=np.float64)
     if pose.shape != (3,) or not np.isfinite(pose).all():
-        raise HmtSlamError(f"{name} = {list(value)} is no pose: give x, y in m and theta in rad")
+        raise HmtSlamError(f"{name} = {value} is no pose: give x, y in m and theta in rad")
     return pose

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
 
 from sensor_msgs.msg import LaserScan
 
@@ -12,9 +14,9 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.laser_mountings import LaserMountings, check_scan_message
 from hmt_slam_ros.ros.map_services import MapServicesNode
+from hmt_slam_ros.ros.scan_merge import ScanMerge
 from hmt_slam_ros.ros.sensor_input import SensorSubscription
 from hmt_slam_ros.ros.sensor_monitor import SensorMonitor
-from hmt_slam_ros.ros.topics import SCAN
 from hmt_slam_ros.sensors import Scan
 
 _LIVE_QUEUE = 200
@@ -32,6 +34,13 @@ _REPORT_PERIOD = 10 * PERIOD
 """Time between two reports of scans that wait, s."""
 _MAX_UNKNOWN_FRAMES = 4
 """Unknown frames for whose transform scans wait."""
+
+
+class _WaitingScan(NamedTuple):
+    """A scan that waits for the transform of its laser, and its topic."""
+
+    topic: str
+    message: LaserScan
 
 
 class ScanIntake:
@@ -56,41 +65,58 @@ class ScanIntake:
         :param resume_stamp: stamp of the last scan before, ns, as in :class:`SensorSubscription`.
         """
         self._node, self._mountings, self._on_received = node, mountings, on_received
-        self.monitor = SensorMonitor(node.diagnostics)
+        topics = node.configuration.sensors.topics
+        self.monitor = SensorMonitor(node.diagnostics, topics)
         self.dropped_count, self.is_paused = 0, False
         self.last_scan_at = self._waiting_since = time.monotonic()
-        self._waiting: deque[LaserScan] = deque()
+        self._waiting: deque[_WaitingScan] = deque()
         self._skipped: Scan | None = None
         self._since_accepted = 0
         self._has_warned = False
         self._unknown_since: dict[str, float] = {}
-        self._subscription = SensorSubscription(
-            node, node.diagnostics, LaserScan, SCAN, check_scan_message, self._on_scan, resume_stamp, self._receive
+        self._merge = ScanMerge(topics, resume_stamp)
+        self._subscriptions = {topic: self._subscription_to(topic, resume_stamp) for topic in topics}
+
+    def _subscription_to(self, topic: str, resume_stamp: int | None) -> SensorSubscription:
+        return SensorSubscription(
+            self._node,
+            self._node.diagnostics,
+            LaserScan,
+            topic,
+            check_scan_message,
+            partial(self._merge_scan, topic),
+            resume_stamp,
+            partial(self._receive, topic),
         )
 
     @property
     def waiting_count(self) -> int:
-        """Number of scans that wait for the laser's transform."""
-        return len(self._waiting)
+        """Number of scans that wait for the laser's transform, or for the scans of other topics."""
+        return len(self._waiting) + self._merge.waiting_count
 
     def start(self) -> None:
         """Subscribe; what was missed since :meth:`stop` comes first, where the publisher is latched."""
         self.last_scan_at = time.monotonic()
         self.monitor.start()
-        self._subscription.start()
+        for subscription in self._subscriptions.values():
+            subscription.start()
 
     def stop(self) -> None:
         """Unsubscribe."""
-        self._subscription.stop()
+        for subscription in self._subscriptions.values():
+            subscription.stop()
 
     def discard_waiting(self) -> None:
-        """Drop the scans that wait for the laser's transform."""
+        """Drop the scans that wait."""
         self._waiting.clear()
+        self._merge.reset()
 
     def reset_stamp_order(self) -> None:
         """Accept any stamp of the next scan."""
         self.monitor.reset()
-        self._subscription.reset_order()
+        self._merge.reset()
+        for subscription in self._subscriptions.values():
+            subscription.reset_order()
 
     def pause(self, *, on: bool) -> None:
         """Skip scans from now on, or resume."""
@@ -107,6 +133,14 @@ class ScanIntake:
         """Count a scan that has come."""
         self._node.diagnostics.received["Scan"] += 1
 
+    def _merge_scan(self, topic: str, scan: Scan) -> None:
+        """Process the scans that are due, now that one more of a topic has come, whose stamp is in order there."""
+        due = self._merge.push(topic, scan)
+        if due is None:
+            self._node.diagnostics.count_refused(topic)
+        for each in due or ():
+            self._on_scan(each)
+
     def _on_scan(self, scan: Scan) -> None:
         """Process a scan whose stamp is in order."""
         self.count_scan()
@@ -116,22 +150,22 @@ class ScanIntake:
             return
         self._node.deliver(scan)
 
-    def _receive(self, _stamp: int, message: LaserScan) -> None:
+    def _receive(self, topic: str, _stamp: int, message: LaserScan) -> None:
         """Let a scan wait until its laser's transform is known."""
         self.last_scan_at = time.monotonic()
-        self.monitor.note_scan()
-        if not self._is_accepted():
+        self.monitor.note_scan(topic)
+        if not self._is_accepted(self._subscriptions[topic].is_best_effort):
             self._count_dropped(1)
             return
         if not self._waiting:
             self._waiting_since, self._has_warned = time.monotonic(), False
-        self._waiting.append(message)
+        self._waiting.append(_WaitingScan(topic, message))
         self._on_received()
 
-    def _is_accepted(self) -> bool:
+    def _is_accepted(self, is_live: bool) -> bool:
         """Whether a scan may wait beside those that do: the more wait the fewer are accepted, evenly spread."""
         queued = self._node.process.queued_scans
-        waiting, is_live = queued + self.waiting_count, self._subscription.is_best_effort
+        waiting = queued + self.waiting_count
         spacing = 2 ** (4 * waiting // _LIVE_QUEUE) if is_live else 1
         self._since_accepted += 1
         if waiting < (_LIVE_QUEUE if is_live else _MAX_WAITING) and self._since_accepted >= spacing:
@@ -151,21 +185,21 @@ class ScanIntake:
         Only those that can be used have a say in the order of stamps.
         """
         while self._waiting:
-            message = self._waiting[0]
+            topic, message = self._waiting[0]
             frame = message.header.frame_id
             try:
-                scan = self._mountings.convert_scan(message)
+                scan = self._mountings.convert_scan(message, topic)
                 if scan is None:
                     if self._is_awaited(frame):
                         return
                     raise HmtSlamError(f"nobody knows the frame '{frame}' of a scan: publish its transform")
             except HmtSlamError as fault:
                 self._waiting.popleft()
-                self._node.diagnostics.refuse(SCAN, fault)
+                self._node.diagnostics.refuse(topic, fault)
                 continue
             self._unknown_since.pop(frame, None)
             self._waiting.popleft()
-            self._subscription.push(scan.stamp, scan)
+            self._subscriptions[topic].push(scan.stamp, scan)
 
     def _is_awaited(self, frame: str) -> bool:
         """Whether the transform of a frame is awaited: for some time, or as long as no other frame's scan waits."""
@@ -173,7 +207,7 @@ class ScanIntake:
             return False
         since = self._unknown_since.setdefault(frame, time.monotonic())
         return time.monotonic() - since < _TRANSFORM_TIMEOUT or not any(
-            self._mountings.is_known(message.header.frame_id) for message in self._waiting
+            self._mountings.is_known(waiting.message.header.frame_id) for waiting in self._waiting
         )
 
     def warn_if_waiting(self) -> None:
@@ -184,7 +218,7 @@ class ScanIntake:
         now = time.monotonic()
         if not self._waiting or now - self._waiting_since <= 2 * PERIOD:
             return
-        sentence = self._mountings.missing_transform_text(self._waiting[0], self.waiting_count)
+        sentence = self._mountings.missing_transform_text(self._waiting[0].message, len(self._waiting))
         if self._has_warned:
             self._node.diagnostics.fail(sentence, lifetime=2 * _REPORT_PERIOD)
         else:

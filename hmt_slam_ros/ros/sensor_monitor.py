@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 
 from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
 from hmt_slam_ros.ros.sensor_input import MIN_BACKWARD_JUMP
@@ -25,12 +26,14 @@ _COMPARED_SCANS = 50
 class SensorMonitor:
     """Checks stamps and rates of the sensors: backward jumps, different clocks, a silent laser."""
 
-    def __init__(self, diagnostics: NodeDiagnostics) -> None:
+    def __init__(self, diagnostics: NodeDiagnostics, topics: Sequence[str]) -> None:
+        """:param topics: those of the scans."""
         self._diagnostics = diagnostics
         self._newest_stamps: dict[type, int] = {}
-        self._last_scan_at = self._checked_at = time.monotonic()
+        self._checked_at = time.monotonic()
+        self._last_scan_at = dict.fromkeys(topics, self._checked_at)
+        self._silent: set[str] = set()
         self._reading_count = 0
-        self._is_silent = False
         self._clock_offset, self._compared_scans = math.inf, 0
 
     def reset(self) -> None:
@@ -72,15 +75,15 @@ class SensorMonitor:
 
     def start(self) -> None:
         """Expect scans from now on."""
-        self._last_scan_at = time.monotonic()
+        self._last_scan_at = dict.fromkeys(self._last_scan_at, time.monotonic())
 
-    def note_scan(self) -> None:
+    def note_scan(self, topic: str) -> None:
         """Take note that a scan has come."""
         now = time.monotonic()
-        if self._is_silent:
-            self._is_silent = False
-            self._diagnostics.note(f"scans come again, after {now - self._last_scan_at:.1f} s")
-        self._last_scan_at = now
+        if topic in self._silent:
+            self._silent.remove(topic)
+            self._diagnostics.note(f"scans come again on {topic}, after {now - self._last_scan_at[topic]:.1f} s")
+        self._last_scan_at[topic] = now
 
     def check_silence(self, reading_count: int) -> None:
         """Report a silent laser; to be called once a second.
@@ -91,12 +94,17 @@ class SensorMonitor:
         """
         now = time.monotonic()
         has_odometry, self._reading_count = reading_count > self._reading_count, reading_count
-        if now - self._checked_at > _BUSY_TIME and not self._is_silent:
-            self._last_scan_at = now
-        self._checked_at = now
-        if has_odometry and not self._is_silent and now - self._last_scan_at > _SILENCE_TIMEOUT:
-            self._is_silent = True
-            self._diagnostics.warn(
-                f"no scan came for {_SILENCE_TIMEOUT:g} s, while odometry does: look at the laser, and at the name and "
-                "the type of the topic scan; meanwhile the pose goes on by odometry"
-            )
+        was_busy, self._checked_at = now - self._checked_at > _BUSY_TIME, now
+        for topic in self._last_scan_at.keys() - self._silent:
+            if was_busy:
+                self._last_scan_at[topic] = now
+            if has_odometry and now - self._last_scan_at[topic] > _SILENCE_TIMEOUT:
+                self._silent.add(topic)
+                self._warn_of_silence(topic)
+
+    def _warn_of_silence(self, topic: str) -> None:
+        others = len(self._silent) < len(self._last_scan_at)
+        self._diagnostics.warn(
+            f"no scan came for {_SILENCE_TIMEOUT:g} s, while odometry does: look at the laser, and at the name and the "
+            f"type of the topic {topic}; meanwhile the pose goes on by {'the other scans' if others else 'odometry'}"
+        )

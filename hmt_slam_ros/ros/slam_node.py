@@ -40,7 +40,7 @@ from hmt_slam_ros.ros.laser_mountings import LaserMountings
 from hmt_slam_ros.ros.map_services import MapLoader, MapSaver, MapServicesNode, StaleSubscribers, declare_folders
 from hmt_slam_ros.ros.message_io import subscribe_document
 from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, OdometryFrames, declare_odometry_frame
-from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_pose
+from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_poses
 from hmt_slam_ros.ros.recovery import CHECKPOINT, ControlEvent, FrameMounting, PauseChange
 from hmt_slam_ros.ros.scan_intake import ScanIntake
 from hmt_slam_ros.ros.topics import INITIAL_POSE, PARTICLES
@@ -94,7 +94,7 @@ class SlamNode(MapServicesNode):
         """
         super().declare_own_parameters()
         self.map_frame, self._base_frame = declare_frame(self, "map", "map"), declare_odometry_frame(self, BASE_FRAME)
-        self._laser_pose = declare_laser_pose(self)
+        self._laser_poses = declare_laser_poses(self, self.configuration.sensors.topics)
         declare_folders(self)
         self._initial_pose = declare_initial_pose(self)
         if self._initial_pose is not None and not self.start_from:
@@ -126,7 +126,7 @@ class SlamNode(MapServicesNode):
             self,
             self.diagnostics,
             self.odometry_frames,
-            self._laser_pose,
+            self._laser_poses,
             self.deliver_ready_scans,
             self.recovery.record_input,
         )

@@ -38,7 +38,7 @@ from hmt_slam_ros.ros.laser_mountings import LaserMountings, check_scan_message
 from hmt_slam_ros.ros.lifecycle import ManagedNode
 from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
 from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, OdometryFrames, declare_odometry_frame
-from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_pose
+from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_poses
 from hmt_slam_ros.ros.topics import (
     CMD_VEL,
     GOAL_POSE,
@@ -81,7 +81,8 @@ class TaskNode(ManagedNode):
     def declare_own_parameters(self) -> None:
         """Declare frames, the laser's pose and ``start_from``."""
         self.map_frame, self._base_frame = declare_frame(self, "map", "map"), declare_odometry_frame(self, BASE_FRAME)
-        self._laser_pose = declare_laser_pose(self)
+        poses = list(declare_laser_poses(self, self.configuration.sensors.topics).values())
+        self._laser_poses = dict.fromkeys((SCAN,), poses[0]) if poses else {}
         self._start_from = declare_start_from(self)
 
     def spin(self) -> None:
@@ -115,7 +116,7 @@ class TaskNode(ManagedNode):
         self._result_publisher = self.create_publisher(String, TASK_RESULTS[self._name], topics.LATCHED)
         self._goals = self.create_publisher(PoseStamped, GOAL_POSE, topics.STREAM)
         frames = OdometryFrames(self.diagnostics, base_frame=self._base_frame)
-        self._mountings = LaserMountings(self, self.diagnostics, frames, self._laser_pose)
+        self._mountings = LaserMountings(self, self.diagnostics, frames, self._laser_poses)
         if Odometry not in SUBSCRIPTIONS[self._name]:
             self.create_subscription(OdometryMessage, ODOM, frames.note, topics.NEWEST)
         self.create_subscription(PoseWithCovarianceStamped, HMT_POSE, self._on_pose, topics.NEWEST)
@@ -189,7 +190,7 @@ class TaskNode(ManagedNode):
         if not self.is_active:
             return
         try:
-            scan = self._mountings.convert_scan(check_scan_message(message))
+            scan = self._mountings.convert_scan(check_scan_message(message), SCAN)
         except HmtSlamError as fault:
             self.diagnostics.refuse(SCAN, fault)
             return
