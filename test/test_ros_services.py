@@ -34,7 +34,7 @@ MESSAGES = Path(__file__).parent.parent / "docs" / "reference" / "messages.md"
 SAID = {f"/{topic.lstrip('/')}" for topic in {*NAMED, *topics.DOCUMENTS.values(), *TRANSFORMS}} - {
     *("/team/statuses", "/team/requests", "/team/updates", "/team/placements", "/hmt/joined_ground"),  # of a team
     "/team/rendezvous",  # likewise
-    *("/initialpose", "/cmd_vel", "/rendezvous"),  # which are subscribed to
+    *("/initialpose", "/cmd_vel", "/rendezvous", "/statement"),  # which are subscribed to
     "/ground_truth",  # of a robot that is driven
     "/hmt/incidents",  # of the page
     *("/goal_pose", "/pilot/place_estimate"),  # of explorer and pilot

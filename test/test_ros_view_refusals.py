@@ -193,7 +193,8 @@ def assert_commands(listener, view, port):
     token = next(re.search("#token=(.*)$", line.strip())[1] for line in view.stderr if "#token=" in line)
     initial_poses = listener.subscribe(PoseWithCovarianceStamped, topics.INITIAL_POSE, topics.STREAM)
     goals = listener.subscribe(PoseStamped, topics.GOAL_POSE, topics.STREAM)
-    for topic in (topics.INITIAL_POSE, topics.GOAL_POSE):
+    statements = listener.subscribe(String, topics.STATEMENT, topics.STREAM)
+    for topic in (topics.INITIAL_POSE, topics.GOAL_POSE, topics.STATEMENT):
         listener.until(lambda topic=topic: listener.node.count_publishers(topic), alive=[view])
 
     def command(**content):
@@ -204,8 +205,10 @@ def assert_commands(listener, view, port):
 
     command(kind="initial_pose", pose=[1.0, 2.0, 0.0])
     command(kind="goal", pose=[3.0, 2.0, 0.0])
+    command(kind="statement", statement="same 3 5 by ann")
     command(kind="save")
-    listener.until(lambda: initial_poses and goals, alive=[view])
+    listener.until(lambda: initial_poses and goals and statements, alive=[view])
+    assert statements[0].data == "same 3 5 by ann"
     assert (initial_poses[0].header.frame_id, initial_poses[0].pose.pose.position.x) == ("map", 1.0)
     assert initial_poses[0].pose.covariance[0] == pytest.approx(0.25)
     assert goals[0].pose.position.x == 3.0

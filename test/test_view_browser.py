@@ -233,8 +233,13 @@ def test_buttons_are_there_where_the_node_allows_them_for_those_who_have_the_tok
     page.until(lambda: page.text("outcome") == "goal -10.00, 0.00 m" and page.text("pause") == "Go on")
     assert page.drawing["middle"] == middle
     page.browser.screenshot(screenshots / "buttons.png")
+    page.browser.evaluate("document.getElementById('statement').value = 'same 3 5 by ann'")
+    page.browser.evaluate("document.querySelector('#state button').click()")
+    page.until(lambda: [command.statement for command in page.commands.take()] == ["same 3 5 by ann"])
     page.board.put("controls", False)
-    page.until(lambda: not is_shown(page, "controls"))
+    page.until(lambda: not is_shown(page, "controls") and not is_shown(page, "state"))
+    page.board.put("recording", {"bag": "monday", "time": 1_137_834_225, "ended": True})
+    page.until(lambda: page.text("recording").startswith("monday, ended "))
 
 
 def test_the_path_and_the_past_are_whole_after_a_reload(map_page, screenshots):

@@ -15,7 +15,7 @@ from std_srvs.srv import SetBool, Trigger
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import header_message, pose_message, pose_with_covariance_message
-from hmt_slam_ros.ros.topics import GOAL_POSE, INITIAL_POSE, TASK_GOALS
+from hmt_slam_ros.ros.topics import GOAL_POSE, INITIAL_POSE, STATEMENT, TASK_GOALS
 from hmt_slam_ros.untrusted_input import shorten
 from hmt_slam_ros.view.board import Board
 from hmt_slam_ros.view.commands import Commands, PageCommand
@@ -40,6 +40,7 @@ class ViewControls:
         self._initial_poses = node.create_publisher(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
         self._goals = node.create_publisher(PoseStamped, GOAL_POSE, topics.STREAM)
         self._tasks = node.create_publisher(String, TASK_GOALS["explorer"], topics.STREAM)
+        self._statements = node.create_publisher(String, STATEMENT, topics.STREAM)
 
     def update(self) -> None:
         """Execute the commands that wait."""
@@ -50,6 +51,8 @@ class ViewControls:
             elif command.kind in ("pause", "resume"):
                 request = SetBool.Request(data=command.kind == "pause")
                 self._call(self._pauses, request, command.kind, "slam/pause")
+            elif command.kind == "statement":
+                self._publish_statement(command.statement)
             elif command.pose is not None:
                 self._publish_pose(command, np.array(command.pose))
 
@@ -70,6 +73,13 @@ class ViewControls:
         if answer.success and isinstance(request, SetBool.Request):
             self._is_paused = request.data
         self._tell("good" if answer.success else "fault", shorten(answer.message) or f"{doing}: done")
+
+    def _publish_statement(self, statement: str) -> None:
+        self._statements.publish(String(data=statement))
+        if self._statements.get_subscription_count():
+            self._tell("good", f"'{statement}' is weighed at the next keyframe")
+        else:
+            self._tell("fault", f"'{statement}': tsbi does not run")
 
     def _publish_pose(self, command: PageCommand, pose: Any) -> None:  # noqa: ANN401  an array (3,)
         stamp = self._node.get_clock().now().nanoseconds

@@ -78,7 +78,7 @@ _ALLOWED_HOSTS = ParameterDescriptor(
     read_only=True,
 )
 _CONTROLS = ParameterDescriptor(
-    description="Whether the page has buttons for save, pause, initial pose and goal, for those who have its token.",
+    description="Whether the page has buttons and takes statements, from those who have its token.",
     read_only=True,
 )
 _PUBLISHERS = {

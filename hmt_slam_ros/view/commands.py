@@ -11,10 +11,11 @@ from email.message import Message
 from typing import Any, Literal, get_args
 
 from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.messages.statements import parse_statement
 from hmt_slam_ros.sensors.plausibility import MAX_COORDINATE
 from hmt_slam_ros.untrusted_input import parse_json, shorten
 
-CommandKind = Literal["save", "pause", "resume", "initial_pose", "goal"]
+CommandKind = Literal["save", "pause", "resume", "initial_pose", "goal", "statement"]
 
 TOKEN_HEADER = "X-Hmt-Token"  # noqa: S105  the name of the header, no secret
 """Header of a request that has the token."""
@@ -33,15 +34,17 @@ _WITH_POSE = ("initial_pose", "goal")
 class PageCommand:
     """What a person wants.
 
-    :ivar kind: "save" the map, "pause" or "resume" the run, tell the "initial_pose" of the robot, or send it to a
-        "goal".
+    :ivar kind: "save" the map, "pause" or "resume" the run, give the "initial_pose" of the robot, send it to a "goal",
+        or make a "statement" about two areas.
     :ivar pose: x, y, m, and heading, rad, in the map, of a pose or goal, else None.
     :ivar area: the area at a goal, None where there is none.
+    :ivar statement: the text of a statement, else empty.
     """
 
     kind: CommandKind
     pose: tuple[float, float, float] | None = None
     area: int | None = None
+    statement: str = ""
 
 
 def parse_command(text: str) -> PageCommand:
@@ -54,6 +57,10 @@ def parse_command(text: str) -> PageCommand:
     kinds = get_args(CommandKind)
     if not isinstance(content, dict) or kind not in kinds:
         raise HmtSlamError(f"kind = {shorten(kind)} is no command: give one of {', '.join(kinds)}")
+    if kind == "statement":
+        statement = str(content.get("statement"))
+        parse_statement(statement)
+        return PageCommand(kind, statement=statement)
     if kind not in _WITH_POSE:
         return PageCommand(kind)
     pose, area = content.get("pose"), content.get("area")

@@ -1,4 +1,4 @@
-// Buttons that change something: save, pause, initial pose and goal; for those who have the token of the page.
+// What changes something: save, pause, initial pose, goal and statements; for those who have the token of the page.
 
 import { text } from "./panels.js";
 
@@ -12,12 +12,17 @@ export class Controls {
     this.token = decodeURIComponent(location.hash.split(KEY)[1] ?? "");
     $("save").addEventListener("click", () => this.send({ kind: "save" }));
     $("pause").addEventListener("click", () => this.send({ kind: this.paused ? "resume" : "pause" }));
+    $("state").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.send({ kind: "statement", statement: $("statement").value });
+    });
     for (const kind of ["initial_pose", "goal"]) $(kind).addEventListener("click", () => this.want(this.wanted === kind ? null : kind));
   }
 
   /** Show the buttons where the node allows them and the token is there. */
   allow(allowed) {
     $("controls").hidden = !allowed;
+    $("state").hidden = !allowed || !this.token;
     for (const button of $("controls").querySelectorAll("button")) button.hidden = !this.token;
     if (allowed && !this.token) this.say("attention", "For buttons open the page by the address that view logged");
   }

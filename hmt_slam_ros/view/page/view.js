@@ -138,6 +138,7 @@ const shown = {
     text($("namespace"), namespace === "/" ? "" : namespace);
     document.title = namespace === "/" ? "hmt_slam" : `hmt_slam ${namespace}`;
   },
+  recording: ({ bag, time, ended }) => text($("recording"), `${bag}, ${ended ? "ended" : "recorded"} ${new Date(1000 * time).toLocaleString()}`),
   verdict: ({ level, text: sentence, advice }) => tellVerdict(level, sentence, advice),
   robot: ({ pose: [x, y, theta], ellipse, deviation, turn }) => {
     text($("position"), `${x.toFixed(2)}, ${y.toFixed(2)} m, ${((theta * 180) / Math.PI).toFixed(0)}°`);
