@@ -27,6 +27,7 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import Explorer
+from hmt_slam_ros.exploration.roadmap import Roadmap
 from hmt_slam_ros.exploration.rooms import named_destinations
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
@@ -128,9 +129,11 @@ def explore_building(seed: int, configuration: Configuration, out: Path) -> Expl
         run.robot.scenario, recording.hybrid_map, recording.replica.scans, run.robot.true_poses, configuration
     )
     frames = {area: (pose.mean, institute.frames[area]) for area, pose in recording.area_poses.items()}
+    roadmap = Roadmap.of_explorer(configuration)
+    roadmap.update_everywhere(institute.hybrid_map, institute.scans)
     places = {
         name: (room.opening.area, se2.transform(frames[room.opening.area][1], room.position[None])[0])
-        for name, room in named_destinations(known_building(institute, configuration), configuration).items()
+        for name, room in named_destinations(known_building(institute, configuration), roadmap.room_numbers()).items()
     }
     return ExploredBuilding(seed, folder, frames, places)
 

@@ -5,18 +5,29 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_floor import AREAS, CONFIGURATION, make_map, seen_at
+from small_floor import AREAS, CONFIGURATION, keyframes, make_map, seen_at
 
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import ExplorationMap
 from hmt_slam_ros.exploration.pilot import PilotProcess
+from hmt_slam_ros.exploration.pose_goals import anchor_pose
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.messages.messages import PoseReset, RealTimePose
+from hmt_slam_ros.messages.map_changes import Arc
+from hmt_slam_ros.messages.messages import ClosureDecision, PoseReset, RealTimePose
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.messages.tasks import PILOT_TASKS, GoalPose, PlaceEstimate, TaskResult, VelocityCommand, parse_task
+from hmt_slam_ros.messages.tasks import (
+    PILOT_TASKS,
+    GoalPose,
+    PlaceEstimate,
+    Task,
+    TaskError,
+    TaskResult,
+    VelocityCommand,
+    parse_task,
+)
 from hmt_slam_ros.sensors import Odometry
 
 PERIOD = 0.2
@@ -86,8 +97,16 @@ class Robot:
         return messages
 
     def do(self, text, steps=600):
+        """How a task of a text ends."""
+        return self.run(parse_task(text, PILOT_TASKS), steps)
+
+    def navigate(self, *pose, steps=600):
+        """How the drive to a pose of the world ends."""
+        return self.run(Task("navigate", "there", goal_of(self.missions, *pose)), steps)
+
+    def run(self, task, steps=600):
         """How a task ends."""
-        messages = self.handle_all(parse_task(text, PILOT_TASKS))
+        messages = self.handle_all(task)
         for _ in range(steps):
             for answer in messages:
                 if isinstance(answer, TaskResult):
@@ -100,6 +119,12 @@ class Robot:
 
     def estimate(self):
         return next(message for message in reversed(self.sent) if isinstance(message, PlaceEstimate))
+
+
+def goal_of(missions, *pose):
+    """A pose of the world as the goal of a task."""
+    frames = {area: PoseGaussian.from_pose(frame) for area, frame in AREAS.items()}
+    return anchor_pose(missions.exploration_map.hybrid_map, frames, np.array(pose))
 
 
 def pose_error(place, pose):
@@ -248,6 +273,73 @@ def test_one_who_drives_the_robot_out_of_a_room_brings_it_before_the_door(saved_
         robot.step((0.0, 0.0, 0.0))
     messages = robot.estimate()
     assert (messages.place, messages.room, messages.confident) == (door_of(missions), None, True)
+
+
+def test_it_drives_to_a_pose_of_the_map_and_turns_there(saved_map):
+    missions = PilotProcess(CONFIGURATION, saved_map)
+    robot = Robot(missions, (12.0, 0.0, math.pi))
+    begun = robot.handle_all(Task("navigate", "there", goal_of(missions, 4.6, 2.4, -1.0)))
+    remaining = []
+    while not any(isinstance(answer, TaskResult) for answer in begun):
+        begun = robot.step()
+        remaining.append(missions.progress.remaining)
+    assert [answer.succeeded for answer in begun if isinstance(answer, TaskResult)] == [True]
+    assert missions.task is None
+    assert missions.progress == (None, 0)
+    known = [each for each in remaining if each is not None]
+    assert 8.0 < known[0] < 16.0
+    assert known[-1] < 0.2
+    off = se2.between(np.array((4.6, 2.4, -1.0)), robot.pose)
+    assert np.hypot(*off[:2]) < 0.2
+    assert abs(off[2]) < 0.12
+    np.testing.assert_array_equal(robot.velocity, 0.0)
+    (goal,) = [answer for answer in robot.sent if isinstance(answer, GoalPose)]
+    np.testing.assert_allclose(se2.compose(AREAS[goal.area], goal.pose), (4.6, 2.4, -1.0), atol=1e-9)
+
+
+def test_a_lost_robot_finds_its_place_before_it_drives_to_a_pose(saved_map):
+    robot = Robot(PilotProcess(CONFIGURATION, saved_map), (12.0, 0.0, math.pi), rtl="door")
+    assert robot.navigate(3.0, 0.0, 0.0).text == "navigate there: the robot is there"
+    assert len(robot.starts()) == 1
+    assert math.dist(robot.pose[:2], (3.0, 0.0)) < 0.2
+
+
+def test_a_goal_moves_with_its_area_when_a_loop_is_closed(saved_map):
+    """The second area moves against the first, while the robot is on its way there."""
+    missions = PilotProcess(CONFIGURATION, saved_map)
+    robot = Robot(missions, (3.0, 0.0, 0.0))
+    robot.handle_all(Task("navigate", "there", goal_of(missions, 12.0, 0.0, math.pi)))
+    for _ in range(5):
+        robot.step()
+    moved = PoseGaussian(se2.compose(AREAS[1], np.array([0.2, 0.1, 0.01])), KNOWN)
+    missions.handle(ClosureDecision(0, 0, arcs=(Arc(0, 1, moved),)))
+    for _ in range(300):
+        if any(isinstance(answer, TaskResult) for answer in robot.step()):
+            break
+    assert missions.task is None
+    # In the area, whose walls did not move, it is where it was given.
+    assert math.dist(robot.pose[:2], (12.0, 0.0)) < 0.2
+    assert abs(se2.wrap(robot.pose[2] - math.pi)) < 0.12
+
+
+def test_a_pose_in_a_wall_is_refused(saved_map):
+    outcome = Robot(PilotProcess(CONFIGURATION, saved_map), (12.0, 0.0, math.pi)).navigate(3.0, 0.95, 0.0)
+    assert not outcome.succeeded
+    assert outcome.reason == "the robot cannot stand there: give a pose on free ground"
+    assert outcome.error is TaskError.GOAL_OCCUPIED
+
+
+def test_a_pose_to_which_no_way_is_known_is_refused():
+    """Nobody has been in the hallway between 5 and 15 m."""
+    hybrid_map, scans = make_map()
+    for keyframe, (x, *_) in enumerate(keyframes()):
+        if 5.2 < x < 15.2:
+            hybrid_map.remove_keyframe(keyframe, int(x > 8.0))
+            del scans[keyframe]
+    saved = Replica(scans, {0: hybrid_map}, {0: 1.0}, {0: 0}).state
+    outcome = Robot(PilotProcess(CONFIGURATION, saved), (18.0, 0.0, 0.0)).navigate(3.0, 0.0, 0.0)
+    assert (outcome.succeeded, outcome.reason) == (False, "no way is known that leads there")
+    assert outcome.error is TaskError.NO_VALID_PATH
 
 
 def test_a_map_without_places_is_refused():

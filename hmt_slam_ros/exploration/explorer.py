@@ -1,4 +1,4 @@
-"""The explorer: drives a robot until a building is known, hallways before rooms, and to named places.
+"""The explorer: drives a robot until a building is known, hallways before rooms, and to named places and poses.
 
 Tomatis, Nourbakhsh and Siegwart (2003): all hallways depth first, then the rooms by backtracking. In a building, whose
 crossings have few arms, depth first is to go to the nearest frontier: behind a crossing the hallway ahead, in a dead
@@ -8,23 +8,34 @@ end the last arm that was left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.exploration.local_motion import turn_in_place
 from hmt_slam_ros.exploration.look_planner import LookPlanner
 from hmt_slam_ros.exploration.path_follower import KeyframeLocator, PathFollower, Route, motion_limits
+from hmt_slam_ros.exploration.pose_goals import anchor_elsewhere, anchor_pose
 from hmt_slam_ros.exploration.roadmap import EntryPoint, Frontier, Roadmap
 from hmt_slam_ros.exploration.teammates import Cost, Teammates, choose_frontier
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME, HybridMap
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.ambiguity import Ambiguity
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message, RealTimePose
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.messages.tasks import GoalPose, Task, TaskResult, VelocityCommand
+from hmt_slam_ros.messages.tasks import (
+    AnchoredPose,
+    GoalPose,
+    Task,
+    TaskError,
+    TaskProgress,
+    TaskResult,
+    VelocityCommand,
+)
 from hmt_slam_ros.sensors import Scan
 
 _MAX_POSE_AGE = NANOSECONDS
@@ -35,6 +46,12 @@ _FRONTIER_TOLERANCE, _PLACE_TOLERANCE = 0.5, 0.15
 
 _BESIDE_FRONTIER = 1.0
 """Distance of a stuck robot from a frontier up to which this counts as reached, m."""
+
+_HEADING_TOLERANCE = math.radians(5.0)
+"""Deviation of the heading at which a pose is reached, rad."""
+
+_TURN_GAIN = 0.5
+"""Share of that deviation which one command turns: the pose is a scan late."""
 
 _RESELECT_DISTANCE = 3.0
 """Remaining distance to a frontier in a hallway at which a new one is chosen, as it moves on, m."""
@@ -102,6 +119,20 @@ class ExplorationMap:
         pose = self._pose
         return pose is not None and abs(stamp - pose.stamp) <= _MAX_POSE_AGE and self.hybrid_map.has_area(pose.area)
 
+    def anchor(self, area_poses: Mapping[int, PoseGaussian], pose: Float64) -> AnchoredPose:
+        """A goal pose, held by the nearest keyframe.
+
+        :param area_poses: {area: ``map_T_area``}.
+        :param pose: ``map_T_goal`` (3,), m and rad.
+        :raises GoalError: outside the map.
+        """
+        return anchor_pose(self.hybrid_map, area_poses, pose)
+
+    def area_of(self, keyframe: int) -> int | None:
+        """The area of a keyframe, None where it is not in the map."""
+        hybrid_map = self.hybrid_map
+        return next((area for area in hybrid_map.area_ids() if keyframe in hybrid_map.keyframes(area)), None)
+
     @property
     def has_changed(self) -> bool:
         """Whether map or area changed since the last `keyframe_locator`."""
@@ -151,8 +182,11 @@ class ExplorationMap:
         """The points of a route (n, 2) in the frame of the base now, m."""
         return self.keyframe_locator.route_in_base(route, self.pose.pose_in_area.mean)
 
-    def goal_pose(self, route: Route) -> tuple[int, Float64]:
-        """The end of a route: its area, and ``area_T_goal`` (3,) with the heading of the route there."""
+    def goal_pose(self, route: Route, goal: AnchoredPose | None) -> tuple[int, Float64]:
+        """The area of a goal, and ``area_T_goal`` (3,); without one, of the end of a route with its heading there."""
+        if goal is not None:
+            area, pose = self.keyframe_locator.area_and_pose(goal.keyframe)
+            return area, se2.compose(pose, goal.pose)
         last = route.points[-2:]
         towards = last[-1] - last[0]
         area, pose = self.keyframe_locator.area_and_pose(route.keyframes[-1])
@@ -200,6 +234,7 @@ class Explorer:
     """The explorer as a process. Consumes Task, Scan, RealTimePose, Ambiguity and the chain; produces tasks' messages.
 
     :ivar exploration_map: the known map.
+    :ivar task: what it does; None without a task.
     """
 
     def __init__(self, configuration: Configuration, known: Replica | None = None) -> None:
@@ -208,7 +243,8 @@ class Explorer:
         self._limits = motion_limits(parameters)
         self._stuck_timeout = round(NANOSECONDS * parameters.stuck_timeout)
         self.exploration_map = ExplorationMap(configuration, known)
-        self._task: Task | None = None
+        self.task: Task | None = None
+        self._goal: AnchoredPose | None = None
         self._tries = 0
         self._target: Frontier | None = None
         self._route: Route | None = None
@@ -226,7 +262,8 @@ class Explorer:
     def handle(self, message: Message) -> list[Message]:
         """Process one message; a scan is answered with velocities."""
         if isinstance(message, Task):
-            self._task = None if message.kind == "stop" else message
+            self.task = None if message.kind == "stop" else message
+            self._goal = message.goal
             self._route, self._tries, self._may_retry = None, 0, True
             self._look_planner.forget_tries()
         elif isinstance(message, Scan):
@@ -234,8 +271,18 @@ class Explorer:
         elif isinstance(message, Ambiguity):
             self._look_planner.add(message)
         else:
+            if isinstance(message, Hypotheses) and self._goal is not None:
+                pruned = {each.keyframe for each in message.pruned_keyframes}
+                self._goal = anchor_elsewhere(self._goal, self.exploration_map.hybrid_map, pruned)
             self.exploration_map.on_message(message)
         return []
+
+    @property
+    def progress(self) -> TaskProgress:
+        """How far the task is."""
+        remaining = self._path_follower.remaining
+        is_known = self._route is not None and math.isfinite(remaining)
+        return TaskProgress(remaining if is_known else None, self._tries)
 
     def _drive(self, scan: Scan) -> list[Message]:
         """Choose a goal if there is none, and follow the route."""
@@ -243,11 +290,11 @@ class Explorer:
         ready = self.exploration_map.is_localized(scan.stamp)
         self.exploration_map.teammates.update(scan.stamp)
         self._look_planner.update(self.exploration_map.event)
-        if ready and self._task is not None:
+        if ready and self.task is not None:
             if self.exploration_map.has_changed and not self._keeps_route():
                 self._route = None
             if self._route is None:
-                outputs += self._choose_goal(self._task, scan.stamp)
+                outputs += self._choose_goal(self.task, scan.stamp)
         self._velocity = self._follow_route(scan, outputs) if ready and self._route is not None else _STAND
         return [*outputs, VelocityCommand(scan.stamp, *self._velocity)]
 
@@ -267,7 +314,7 @@ class Explorer:
 
     @property
     def _is_exploring(self) -> bool:
-        return self._task is not None and self._task.kind == "explore"
+        return self.task is not None and self.task.kind == "explore"
 
     @property
     def _is_ambiguous(self) -> bool:
@@ -284,11 +331,23 @@ class Explorer:
         """The velocities along the route; messages at its end are added to ``outputs``."""
         assert self._route is not None
         command = self._path_follower.steer(scan, self.exploration_map.route_in_base(self._route), self._velocity)
+        if self._goal is not None and self._path_follower.has_arrived:
+            return self._turn_to_goal(self._goal, outputs)
         if self._path_follower.has_arrived or self._path_follower.is_stuck(scan.stamp, self._stuck_timeout):
             # A frontier is visible from beside it.
             near = self._is_exploring and self._path_follower.remaining <= _BESIDE_FRONTIER
             outputs += self._finish_route(reached=self._path_follower.has_arrived or near)
         return command.speed, command.turn_rate
+
+    def _turn_to_goal(self, goal: AnchoredPose, outputs: list[Message]) -> tuple[float, float]:
+        """The velocities at the position of a goal pose, until the robot has its heading."""
+        own = self.exploration_map.pose.pose_in_area.mean
+        pose = se2.compose(self.exploration_map.keyframe_locator.keyframe_pose(goal.keyframe), goal.pose)
+        angle = float(se2.between(own, pose)[2])
+        if abs(angle) <= _HEADING_TOLERANCE:
+            outputs += self._finish_task("the robot is there", reached=True)
+            return _STAND
+        return turn_in_place(_TURN_GAIN * angle, self._limits)[:2]
 
     def _finish_route(self, *, reached: bool) -> list[Message]:
         """End the route, and with it the task to go to a place."""
@@ -309,14 +368,17 @@ class Explorer:
         if reached:
             return self._finish_task("the robot is there", reached=True)
         if self._tries >= _TRIES:
-            return self._finish_task("given up: something is in the way", reached=False)
+            return self._fail_task("given up: something is in the way", TaskError.FAILED_TO_MAKE_PROGRESS)
         return []
 
-    def _finish_task(self, text: str, *, reached: bool) -> list[Message]:
-        assert self._task is not None
-        result = TaskResult(self._task, reached, text)
-        self._task = self._route = None
+    def _finish_task(self, text: str, *, reached: bool, error: TaskError = TaskError.UNKNOWN) -> list[Message]:
+        assert self.task is not None
+        result = TaskResult(self.task, reached, text, error)
+        self.task = self._route = self._goal = None
         return [result]
+
+    def _fail_task(self, text: str, error: TaskError) -> list[Message]:
+        return self._finish_task(text, reached=False, error=error)
 
     def _choose_goal(self, task: Task, stamp: int) -> list[Message]:
         """Plan a route for a task."""
@@ -325,11 +387,16 @@ class Explorer:
             return []
         self._is_looking = task.kind == "disambiguate" or self._looks_first
         self._is_backtracking = not self._is_looking and self._is_ambiguous
-        planners = {"explore": self._plan_to_frontier, "go": self._plan_to_place, "backtrack": self._plan_backtracking}
+        planners = {
+            "explore": self._plan_to_frontier,
+            "go": self._plan_to_place,
+            "navigate": self._plan_to_pose,
+            "backtrack": self._plan_backtracking,
+        }
         plan = self._plan_look if self._is_looking else planners[task.kind]
         outputs = self._plan_backtracking(here) if self._is_backtracking else plan(here)
         if self._route is not None:
-            area, goal = self.exploration_map.goal_pose(self._route)
+            area, goal = self.exploration_map.goal_pose(self._route, self._goal)
             outputs.append(GoalPose(stamp, area, goal))
         return outputs
 
@@ -383,14 +450,30 @@ class Explorer:
 
     def _plan_to_place(self, here: EntryPoint) -> list[Message]:
         """Plan to a named place."""
-        assert self._task is not None
+        assert self.task is not None
         places, roadmap = self.exploration_map.named_places(), self.exploration_map.roadmap
-        keyframe = places.get(self._task.place)
+        keyframe = places.get(self.task.place)
         if keyframe is None:
             return self._finish_task(f"there is no such place: choose from {', '.join(places)}", reached=False)
         if keyframe not in roadmap.distances(here.keyframe):
-            return self._finish_task("no way is known that leads there", reached=False)
+            return self._fail_task("no way is known that leads there", TaskError.NO_VALID_PATH)
         self._set_route(here, roadmap.shortest_path(here.keyframe, keyframe), here.path[:0], _PLACE_TOLERANCE)
+        return []
+
+    def _plan_to_pose(self, here: EntryPoint) -> list[Message]:
+        """Plan to the goal pose."""
+        assert self._goal is not None
+        known, roadmap = self.exploration_map, self.exploration_map.roadmap
+        if self._goal.keyframe not in known.keyframe_locator:
+            return self._fail_task("its part of the map was discarded: give it again", TaskError.GOAL_OUTSIDE_MAP)
+        area, keyframe_pose = known.keyframe_locator.area_and_pose(self._goal.keyframe)
+        pose = se2.compose(keyframe_pose, self._goal.pose)
+        end = roadmap.path_to(known.hybrid_map, known.replica.scans, area, pose)
+        if end is None:
+            return self._fail_task("the robot cannot stand there: give a pose on free ground", TaskError.GOAL_OCCUPIED)
+        if end.keyframe not in roadmap.distances(here.keyframe):
+            return self._fail_task("no way is known that leads there", TaskError.NO_VALID_PATH)
+        self._set_route(here, roadmap.shortest_path(here.keyframe, end.keyframe), end.path, _PLACE_TOLERANCE)
         return []
 
     def _plan_backtracking(self, here: EntryPoint) -> list[Message]:

@@ -225,6 +225,12 @@ def command_towards(
     return MotionCommand(speed, turn_rate, arrived=False)
 
 
+def turn_in_place(angle: float, limits: MotionLimits) -> MotionCommand:
+    """The command for a turn on the spot by an angle, rad."""
+    rate = min(limits.turn_rate, math.sqrt(2.0 * limits.turn_acceleration * abs(angle)), abs(angle) / limits.period)
+    return MotionCommand(0.0, math.copysign(rate, angle), arrived=False)
+
+
 def _field_of_view(scan: Scan) -> float:
     """Largest bearing to both sides of the robot within the field of view, rad."""
     first, last = scan.angle_min, scan.angle_min + scan.angle_increment * (scan.ranges.size - 1)

@@ -16,7 +16,7 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
-from hmt_slam_ros.exploration.local_motion import MotionCommand, MotionLimits, command_towards
+from hmt_slam_ros.exploration.local_motion import MotionCommand, MotionLimits, command_towards, turn_in_place
 from hmt_slam_ros.exploration.path_follower import PathFollower
 from hmt_slam_ros.exploration.rooms import Destination, KnownBuilding, RoomFilter
 from hmt_slam_ros.geometry import se2
@@ -316,7 +316,7 @@ class MissionController:
             return self._turn_at_node(scan)
         if not self._before_door:
             return self._command_towards(scan, front)
-        return self._command_towards(scan, beyond) if aligned else self._turn_in_place(angle)
+        return self._command_towards(scan, beyond) if aligned else turn_in_place(angle, self._limits)
 
     def _enter_room(self, start: MetricInitialPose, scan: Scan) -> MotionCommand:
         """Switch to the metric filter."""
@@ -324,12 +324,6 @@ class MissionController:
         self._entered_destination, self.initial_pose, self.phase = self._goal, start, Phase.ROOM
         self._path_follower = PathFollower(self._limits, _PLACE_TOLERANCE)
         return self._drive_into_room(scan)
-
-    def _turn_in_place(self, angle: float) -> MotionCommand:
-        """The command for a turn on the spot by an angle, rad."""
-        limits = self._limits
-        rate = min(limits.turn_rate, math.sqrt(2.0 * limits.turn_acceleration * abs(angle)), abs(angle) / limits.period)
-        return MotionCommand(0.0, math.copysign(rate, angle), arrived=False)
 
     def _drive_into_room(self, scan: Scan) -> MotionCommand:
         """Drive to the destination in the room."""

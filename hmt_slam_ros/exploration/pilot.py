@@ -6,6 +6,9 @@ Tomatis, Nourbakhsh and Siegwart (2003), sections 3.3 and 3.4.
 2. At an opening a confident belief gives metric SLAM an initial pose, if that is lost.
 3. Behind the door of a task the metric filter of the room steers the robot (rooms.py).
 4. There the pose of RTL is compared with that by the door, which shows whether either is wrong.
+
+On its way to a pose the pilot localizes the robot in the same way, if metric SLAM is lost, and then drives as the
+explorer does.
 """
 
 from __future__ import annotations
@@ -17,6 +20,8 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
+from hmt_slam_ros.exploration.explorer import ExplorationMap, Explorer
+from hmt_slam_ros.exploration.local_motion import MotionCommand
 from hmt_slam_ros.exploration.mission_controller import MissionController, Phase
 from hmt_slam_ros.exploration.path_follower import motion_limits
 from hmt_slam_ros.exploration.rooms import KnownBuilding, named_destinations
@@ -25,9 +30,17 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.map_changes import InitialPose
-from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message, PoseReset, RealTimePose
+from hmt_slam_ros.messages.messages import Message, PoseReset, RealTimePose
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
-from hmt_slam_ros.messages.tasks import GoalPose, PlaceEstimate, Task, TaskResult, VelocityCommand
+from hmt_slam_ros.messages.tasks import (
+    GoalPose,
+    PlaceEstimate,
+    Task,
+    TaskError,
+    TaskProgress,
+    TaskResult,
+    VelocityCommand,
+)
 from hmt_slam_ros.places.edge_existence import EdgeMonitor
 from hmt_slam_ros.places.observation_graph import QUARTER_TURN, QUARTERS
 from hmt_slam_ros.places.place_graph import DIRECTION_NAMES, state_of
@@ -68,21 +81,19 @@ class MetricPoseTracker:
     A lost robot maps new areas, which a loop closure joins to the map later.
     """
 
-    def __init__(self, replica: Replica) -> None:
-        """:param replica: the initial map."""
-        self._replica = replica
+    def __init__(self, current_map: ExplorationMap) -> None:
+        """:param current_map: the map of metric SLAM, kept up to date."""
+        self._map = current_map
         self._readings = OdometryBuffer()
         self._last_pose: RealTimePose | None = None
         self._predicted_pose: PoseGaussian | None = None
 
     def on_message(self, message: Message) -> None:
-        """Process odometry, a pose, or a message of the chain."""
+        """Process odometry or a pose."""
         if isinstance(message, Odometry):
             self._readings.add(message)
         elif isinstance(message, RealTimePose):
             self._last_pose = message
-        elif isinstance(message, Keyframe | Hypotheses | ClosureDecision):
-            self._replica.apply_message(message)
 
     def predict_to(self, stamp: int) -> None:
         """Move the pose to a time, ns, by odometry."""
@@ -99,7 +110,7 @@ class MetricPoseTracker:
         Metric SLAM matches with a submap that is assembled by the arcs. So the pose relative to an area is as accurate
         as the match, for any number of arcs in between.
         """
-        hybrid_map = self._replica.maps[self._replica.best_hypothesis]
+        hybrid_map = self._map.hybrid_map
         if self._predicted_pose is None or self._last_pose is None or not hybrid_map.has_area(area):
             return None
         frame = connected_areas(hybrid_map, area).get(self._last_pose.area)
@@ -122,6 +133,8 @@ class PilotProcess:
 
     :ivar rooms: {name: destination} of tasks.
     :ivar controller: drives the robot.
+    :ivar exploration_map: the map of metric SLAM.
+    :ivar task: what it does; None without a task.
     """
 
     def __init__(self, configuration: Configuration, saved: ReplicaState) -> None:
@@ -132,12 +145,14 @@ class PilotProcess:
         replica = Replica.from_state(saved)
         self._configuration = configuration
         self._building = KnownBuilding.from_map(replica.maps[replica.best_hypothesis], replica.scans, configuration)
-        self._metric_poses = MetricPoseTracker(Replica.from_state(saved))
+        self._pose_driver = Explorer(configuration, Replica.from_state(saved))
+        self.exploration_map = self._pose_driver.exploration_map
+        self._metric_poses = MetricPoseTracker(self.exploration_map)
         self._limits = motion_limits(configuration.explorer)
         self._task_timeout = round(NANOSECONDS * configuration.pilot.task_timeout)
         self._edge_monitor = EdgeMonitor(self._building.graph, configuration.features)
         self._uniform_belief = uniform_belief(self._building.graph, configuration.places)
-        self.rooms = named_destinations(self._building, configuration)
+        self.rooms = named_destinations(self._building, self.exploration_map.roadmap.room_numbers())
         self._reset()
 
     def _reset(self) -> None:
@@ -146,7 +161,8 @@ class PilotProcess:
         self._readings = OdometryBuffer()
         self._waiting: deque[Scan] = deque(maxlen=_MAX_WAITING_SCANS)
         self._stamp, self._odometry = 0, np.zeros(3)
-        self._task: Task | None = None
+        self.task: Task | None = None
+        self._is_driving_to_pose = False
         self._task_start: int | None = None
         self._unconfirmed_pose: MetricInitialPose | None = None
         self._pose_reset_stamp: int | None = None
@@ -164,6 +180,8 @@ class PilotProcess:
             return self._accept_task(message)
         outputs: list[Message] = []
         self._metric_poses.on_message(message)
+        if not isinstance(message, Odometry | Scan):
+            self._pose_driver.handle(message)
         if isinstance(message, Odometry):
             self._readings.add(message)
         elif isinstance(message, Scan):
@@ -182,25 +200,30 @@ class PilotProcess:
             return [TaskResult(task, False, f"there is no such room: choose from {choice}")]
         if task.kind == "stop":
             return self._stop()
-        self._task, self._task_start = task, None
-        goal = self.rooms.get(task.place)
+        self.task, self._task_start = task, None
+        self._is_driving_to_pose = False
+        goal = None if task.kind == "navigate" else self.rooms.get(task.place)
+        if task.kind == "navigate":
+            self._pose_driver.handle(task)
+            self._unconfirmed_pose = None
         if self.controller.room is None or goal is not None:
             self.controller.start_mission(goal)
         return [] if goal is None else [GoalPose(self._stamp, goal.opening.area, goal.pose)]
 
     def _stop(self) -> list[Message]:
         """Stop the robot, if it has a task."""
-        if self._task is None:
+        if self.task is None:
             return []
         self.controller.stop()
-        self._task = None
+        self._pose_driver.handle(Task("stop"))
+        self.task = None
         return [VelocityCommand(self._stamp, 0.0, 0.0)]
 
     def _handle_time_jump(self, stamp: int) -> list[Message]:
         """Reset the pilot if time went back."""
         if stamp > self._stamp - _TIME_JUMP:
             return []
-        task, commands = self._task, self._stop()
+        task, commands = self.task, self._stop()
         self._reset()
         results = [] if task is None else [TaskResult(task, False, "given up: time went back")]
         return [*results, *commands]
@@ -219,13 +242,34 @@ class PilotProcess:
             self._begin_room(self.controller.initial_pose)
         self._detect_room_exit()
         outputs = [self._place_estimate(), *self._reset_pose_at_opening(), *self._confirm_room_pose()]
-        if self._task is None:
+        if self.task is None:
             return outputs
-        result = self._task_result(self._task)
+        result = self._task_result(self.task)
         if result is not None:
             return [*outputs, result, *self._stop()]
+        if self.task.kind == "navigate":
+            return [*outputs, *self._drive_to_pose(self.task, scan, command)]
         velocity = command[:2] if self._unconfirmed_pose is None else (0.0, 0.0)
         return [*outputs, VelocityCommand(scan.stamp, *velocity)]
+
+    def _drive_to_pose(self, task: Task, scan: Scan, command: MotionCommand) -> list[Message]:
+        """Drive along hallways until metric SLAM has the robot in the map, then to the pose."""
+        assert task.goal is not None
+        if not self._is_driving_to_pose:
+            area = self.exploration_map.area_of(task.goal.keyframe)
+            if area is not None and self._metric_poses.pose_in_area(area) is None:
+                return [VelocityCommand(scan.stamp, *command[:2])]
+            self._is_driving_to_pose = True
+            self.controller.stop()
+        outputs = self._pose_driver.handle(scan)
+        if self._pose_driver.task is None:
+            self.task = None
+        return outputs
+
+    @property
+    def progress(self) -> TaskProgress:
+        """How far the task is; the path to a room is not known beforehand."""
+        return self._pose_driver.progress if self._is_driving_to_pose else TaskProgress()
 
     def _predict(self, odometry: Float64) -> None:
         """Move the robot to an odometry pose, ``odom_T_base`` (3,)."""
@@ -237,8 +281,8 @@ class PilotProcess:
 
     def _begin_room(self, start: MetricInitialPose | None) -> None:
         """Note the start of a room's metric filter."""
-        assert self._task is not None
-        self._room_name, self._pose_reset_stamp, self._unconfirmed_pose = self._task.place, None, start
+        assert self.task is not None
+        self._room_name, self._pose_reset_stamp, self._unconfirmed_pose = self.task.place, None, start
 
     def _confirm_room_pose(self) -> list[Message]:
         """Let the robot stand before a door until metric SLAM agrees with its pose there, or does not find it.
@@ -266,7 +310,7 @@ class PilotProcess:
         """The initial pose by the opening that a robot without a task faces, once, if metric SLAM is lost."""
         estimator = self.controller.estimator
         opening = estimator.arrivals, estimator.node_and_direction
-        if self._task is not None or self.controller.room is not None:
+        if self._is_on_mission or self.controller.room is not None:
             return []
         if opening == self._last_opening or self._is_turning:
             return []
@@ -276,6 +320,11 @@ class PilotProcess:
         self._last_opening = opening
         known = self._metric_poses.pose_in_area(start.area) is not None
         return [] if known else [PoseReset(InitialPose(start.area, start.pose))]
+
+    @property
+    def _is_on_mission(self) -> bool:
+        """Whether the robot is on its way by the belief over places."""
+        return self.task is not None and self.task.kind != "navigate"
 
     @property
     def _is_turning(self) -> bool:
@@ -304,7 +353,7 @@ class PilotProcess:
     def _detect_room_exit(self) -> None:
         """Continue at the node before the door, if the robot was driven out of a room without a task."""
         room = self.controller.room
-        if room is None or self._task is not None:
+        if room is None or self._is_on_mission:
             return
         node, opening, *_ = self.rooms[self._room_name]
         offset = se2.between(opening.landmark.pose.mean, room.pose)
@@ -340,7 +389,9 @@ class PilotProcess:
         if task.kind == "go" and self.controller.phase is Phase.THERE:
             return TaskResult(task, True, "the robot is there")
         if self.controller.phase is Phase.LOST:
-            return TaskResult(task, False, "no way is known that leads there")
+            return TaskResult(task, False, "no way is known that leads there", TaskError.NO_VALID_PATH)
         if self._stamp - self._task_start > self._task_timeout:
-            return TaskResult(task, False, f"given up after {self._configuration.pilot.task_timeout:g} s")
+            return TaskResult(
+                task, False, f"given up after {self._configuration.pilot.task_timeout:g} s", TaskError.TIMEOUT
+            )
         return None

@@ -90,6 +90,9 @@ _MAX_EDGE_LENGTH = 8.0
 _MAX_DRIVEN_STEP = 1.5
 """Largest distance between consecutive keyframes that the robot drove between, m."""
 
+_MAX_GOAL_SHIFT = 0.08
+"""Largest distance of a goal from the middle of a free cell, m: half its diagonal."""
+
 _BESIDE = 1.5
 """Largest distance of keyframes that may replace each other, m."""
 
@@ -117,10 +120,10 @@ class Frontier:
 
 
 class EntryPoint(NamedTuple):
-    """The robot's path to the roadmap.
+    """A path between the roadmap and a pose.
 
     :ivar keyframe: the nearest.
-    :ivar path: shape (n, 2), from the robot to there, m, in the frame of the keyframe's base.
+    :ivar path: shape (n, 2), from the robot to there, or from there to a goal, m, in the frame of the keyframe's base.
     """
 
     keyframe: int
@@ -159,12 +162,7 @@ class Roadmap:
         :param pose: ``area_T_base`` (3,), m and rad.
         :returns: the robot's path to the roadmap, None without keyframes around it.
         """
-        poses = {
-            keyframe: placed
-            for other, belief in areas_around(hybrid_map, area, Neighborhood(_MAX_AREA_DEVIATION, _SCAN_RADIUS)).items()
-            for keyframe, own in hybrid_map.keyframes(other).items()
-            if math.dist((placed := se2.compose(belief.mean, own))[:2], pose[:2]) <= _SCAN_RADIUS
-        }
+        poses = _keyframes_around(hybrid_map, area, pose)
         names = sorted(poses)
         if not names:
             return None
@@ -175,6 +173,22 @@ class Roadmap:
         self._connect_keyframes(names, placed, ground, pose, doors)
         self._find_frontiers(names, placed, ground, pose, doors)
         return self._entry_point(names, placed, ground, pose)
+
+    def path_to(self, hybrid_map: HybridMap, scans: Mapping[int, Scan], area: int, pose: Float64) -> EntryPoint | None:
+        """The path from the nearest keyframe to a pose; None where the robot cannot stand there.
+
+        :param area: in whose frame the pose is.
+        :param pose: ``area_T_goal`` (3,), m and rad.
+        """
+        poses = _keyframes_around(hybrid_map, area, pose)
+        names = sorted(poses)
+        placed = np.array([poses[keyframe] for keyframe in names])
+        ground = NavigationGrid([scans[keyframe] for keyframe in names], placed, self._min_clearance)
+        path = ground.path_to(pose[:2])
+        if path is None or math.dist(path.points[-1], pose[:2]) > _MAX_GOAL_SHIFT:
+            return None
+        points = np.concatenate((path.points[:-1], pose[None, :2]))
+        return EntryPoint(names[path.keyframe_row], se2.transform(se2.inverse(placed[path.keyframe_row]), points))
 
     def update_everywhere(self, hybrid_map: HybridMap, scans: Mapping[int, Scan]) -> None:
         """Update roadmap and frontiers of a whole map."""
@@ -355,6 +369,16 @@ class Roadmap:
         within.add_nodes_from(self.graph)
         within.add_edges_from((a, b) for a, b, door in self.graph.edges(data="door") if not door)
         return within
+
+
+def _keyframes_around(hybrid_map: HybridMap, area: int, pose: Float64) -> dict[int, Float64]:
+    """{keyframe: ``area_T_keyframe`` (3,)} of those near a pose in an area (3,)."""
+    return {
+        keyframe: placed
+        for other, belief in areas_around(hybrid_map, area, Neighborhood(_MAX_AREA_DEVIATION, _SCAN_RADIUS)).items()
+        for keyframe, own in hybrid_map.keyframes(other).items()
+        if math.dist((placed := se2.compose(belief.mean, own))[:2], pose[:2]) <= _SCAN_RADIUS
+    }
 
 
 def _is_near(place: Float64, pose: Float64) -> bool:

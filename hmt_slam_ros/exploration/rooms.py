@@ -16,7 +16,6 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.exploration.roadmap import Roadmap
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.surroundings import Neighborhood, areas_around, stack_poses
@@ -108,12 +107,13 @@ def destinations(known: KnownBuilding) -> dict[int, Destination]:
     return {destination.node: destination for destination in _all_destinations(known)}
 
 
-def named_destinations(known: KnownBuilding, configuration: Configuration) -> dict[str, Destination]:
+def named_destinations(known: KnownBuilding, numbers: Mapping[int, int]) -> dict[str, Destination]:
     """{name: destination}: "room 3" has the number that it has for the explorer, which begins with this map.
 
     A further door of a room is "room 3 by door 7". What the explorer takes for a hallway has a number after the rooms.
+
+    :param numbers: {keyframe: number of its room}, of the explorer's roadmap.
     """
-    numbers = _roadmap(known, configuration).room_numbers()
     named: dict[str, Destination] = {}
     further = max(numbers.values(), default=0)
     for each in _all_destinations(known):
@@ -124,12 +124,6 @@ def named_destinations(known: KnownBuilding, configuration: Configuration) -> di
         names = (room, door, f"{door} {DIRECTION_NAMES[each.opening.direction]}")
         named[next(name for name in names if name not in named)] = each
     return named
-
-
-def _roadmap(known: KnownBuilding, configuration: Configuration) -> Roadmap:
-    roadmap = Roadmap.of_explorer(configuration)
-    roadmap.update_everywhere(known.hybrid_map, known.scans)
-    return roadmap
 
 
 def _all_destinations(known: KnownBuilding) -> Iterator[Destination]:
