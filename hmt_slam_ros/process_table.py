@@ -208,6 +208,7 @@ DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow(f"{_DOCUMENTS}:ResetRequest", "hmt/reset_request", "reset_request", 1),
     DocumentRow(f"{_DOCUMENTS}:ResetResponse", "hmt/reset_response", "reset_response", 1),
     DocumentRow("hmt_slam_ros.messages.tasks:PlaceEstimate", "pilot/place_estimate", "place_estimate", 2),
+    DocumentRow("hmt_slam_ros.messages.tasks:TaskFeedback", "hmt/task_feedback", "task_feedback", 1),
     DocumentRow(f"{_MESSAGES}:EarlyEstimate", "hmt/early_estimate", "early_estimate", 1),
     DocumentRow("hmt_slam_ros.messages.ambiguity:Ambiguity", "hmt/ambiguity", "ambiguity", 1),
     DocumentRow("hmt_slam_ros.messages.topology:Topology", "hmt/topology", "topology", 2),

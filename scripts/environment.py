@@ -1,9 +1,9 @@
 """Make the virtual environment for tests and the demonstration, and keep it up to date.
 
 Where a Jazzy is sourced, its packages are used and only what it lacks is installed. Elsewhere a real rclpy comes from
-PyPI, and tf2_msgs, of which PyPI has no wheel, is compiled from scripts/tf2_msgs; versions and hashes are those of
-requirements/*.txt. Nothing but the standard library is needed to run this file; it prints the path of the environment's
-Python interpreter on standard output.
+PyPI. tf2_msgs and nav2_msgs, of which PyPI has no wheels, are compiled from scripts/tf2_msgs and scripts/nav2_msgs.
+Versions and hashes are those of requirements/*.txt. Nothing but the standard library is needed to run this file; it
+prints the path of the environment's Python interpreter on standard output.
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ import subprocess
 import sys
 import sysconfig
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-TF2_MSGS = ROOT / "scripts" / "tf2_msgs"
+INTERFACES = (ROOT / "scripts" / "tf2_msgs", ROOT / "scripts" / "nav2_msgs")
 REQUIREMENTS = ROOT / "requirements"
 FLOOR = REQUIREMENTS / "floor.txt"
 
@@ -62,12 +64,12 @@ class Environment:
         """Print a line of progress with the seconds since the start."""
         print(f"[{time.monotonic() - self.started:4.0f} s] {text}", file=sys.stderr, flush=True)
 
-    def run(self, *command: str | Path, problem: str, **variables: str) -> None:
-        """Run a command of the environment, its output going to the environment's last_step.log.
+    def run(self, *command: str | Path, problem: str, log_name: str = "last_step.log", **variables: str) -> None:
+        """Run a command of the environment, its output going to a file of the environment.
 
         :raises EnvironmentSetupError: if it fails; the sentence starts with `problem`.
         """
-        log = self.path / "last_step.log"
+        log = self.path / log_name
         path = f"{self.path / 'bin'}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
         with log.open("w") as output:
             result = subprocess.run(
@@ -178,14 +180,14 @@ def install_ros(environment: Environment) -> None:
     environment.install_requirements("ros", "pip could not install rclpy; is PyPI in reach?")
     missing = missing_for_compilation()
     if missing:
-        environment.report_progress(f"tf2_msgs is left out and /tf stays silent: {missing} and run this again")
+        environment.report_progress(f"/tf stays silent and navigate_to_pose is left out: {missing} and run this again")
     else:
-        environment.report_progress("compiling tf2_msgs, for /tf")
-        build_tf2_msgs(environment)
+        environment.report_progress("compiling tf2_msgs and nav2_msgs, for /tf and navigate_to_pose")
+        build_interfaces(environment)
 
 
 def missing_for_compilation() -> str:
-    """Return what to install before tf2_msgs can be compiled, as an instruction; empty if nothing is missing."""
+    """Return what to install before interfaces can be compiled, as an instruction; empty if nothing is missing."""
     if not (Path(sysconfig.get_paths()["include"]) / "Python.h").is_file():
         return "install Python's headers (python3-dev on Debian and Ubuntu)"
     if not shutil.which("c++"):
@@ -193,11 +195,17 @@ def missing_for_compilation() -> str:
     return ""
 
 
-def build_tf2_msgs(environment: Environment) -> None:
-    """Compile tf2_msgs into the environment, with the ROS build tools of PyPI."""
+def build_interfaces(environment: Environment) -> None:
+    """Compile the interfaces into the environment, both at once, with the ROS build tools of PyPI."""
     environment.install_requirements("tf2_msgs", "pip could not install the tools for tf2_msgs; is PyPI in reach?")
     mend_wheels(environment)
-    build = environment.path / "build_tf2_msgs"
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(partial(build_interface, environment), INTERFACES))
+
+
+def build_interface(environment: Environment, source: Path) -> None:
+    """Compile an interface package into the environment."""
+    build = environment.path / f"build_{source.name}"
     options = {
         "CMAKE_PREFIX_PATH": environment.path,
         "CMAKE_INSTALL_PREFIX": environment.path,
@@ -205,7 +213,7 @@ def build_tf2_msgs(environment: Environment) -> None:
         "BUILD_TESTING": "OFF",
     }
     steps: tuple[tuple[str | Path, ...], ...] = (
-        ("-S", TF2_MSGS, "-B", build, "-GNinja", *(f"-D{name}={value}" for name, value in options.items())),
+        ("-S", source, "-B", build, "-GNinja", *(f"-D{name}={value}" for name, value in options.items())),
         ("--build", build),
         ("--install", build),
     )
@@ -214,7 +222,8 @@ def build_tf2_msgs(environment: Environment) -> None:
         environment.run(
             environment.path / "bin" / "cmake",
             *step,
-            problem="tf2_msgs could not be compiled",
+            problem=f"{source.name} could not be compiled",
+            log_name=f"{source.name}.log",
             AMENT_PREFIX_PATH=str(environment.path),
         )
     shutil.rmtree(build)
@@ -236,7 +245,7 @@ def update(environment: Environment) -> None:
     needs = f"{sys.version} {ROOT} {environment.jazzy} {environment.floor} {missing_for_compilation()}"
     steps = {
         "project": (digest(REQUIREMENTS, ROOT / "setup.py", ROOT / "setup.cfg", also=needs), install_project),
-        "ros": (digest(REQUIREMENTS, TF2_MSGS, also=needs), install_ros),
+        "ros": (digest(REQUIREMENTS, *INTERFACES, also=needs), install_ros),
     }
     if all(environment.is_up_to_date(name, wanted) for name, (wanted, _) in steps.items()):
         return

@@ -147,14 +147,14 @@ _MESSAGE_TOPICS = {
     "EndOfRun": ("hmt/finished",),
     "RealTimePose": ("hmt/pose", "pose"),
     "VelocityCommand": ("cmd_vel",),
-    "Task": ("~/task",),
+    "Task": ("~/task", "~/goal"),
     "TaskResult": (),
 }
 """{message class: its topics}; the robot of a simulation gets a TaskResult only within one program."""
 
 _REQUESTS, _RESPONSES = ("hmt/save_request", "hmt/reset_request"), ("hmt/save_response", "hmt/reset_response")
 
-_TASK_TOPICS = ("cmd_vel", "~/task_result", "goal_pose")
+_TASK_TOPICS = ("cmd_vel", "~/task_result", "hmt/task_feedback", "goal_pose")
 """Published by the nodes that carry out tasks."""
 
 _FURTHER_PUBLISHED: dict[str, tuple[str, ...]] = {
@@ -167,7 +167,10 @@ _FURTHER_PUBLISHED: dict[str, tuple[str, ...]] = {
     "explorer": _TASK_TOPICS,
     "pilot": (*_TASK_TOPICS, "pilot/place_estimate", "initialpose"),
     "view": ("hmt/incidents",),
-    "operator": ("initialpose", "statement", "rendezvous", "explorer/task", "pilot/task"),
+    "operator": (
+        *("initialpose", "statement", "rendezvous"),
+        *("explorer/task", "explorer/goal", "pilot/task", "pilot/goal"),
+    ),
 }
 """{node: topics that follow from no message of the process table}."""
 
@@ -188,6 +191,7 @@ _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
         *("map", "pose", "hmt/pose", "hmt/graph", "hmt/particles", "diagnostics", "hmt/incidents", "hmt/notices"),
         *("scan", "tf", "tf_static", "explorer/task_result", "pilot/task_result", "pilot/place_estimate"),
         *("hmt/ambiguity", "hmt/ambiguity_goal", "hmt/path", "hmt/topology", "hmt/alternatives", "hmt/evidence"),
+        "hmt/task_feedback",
     ),
 }
 """{node: topics that follow from no message of the process table}."""
@@ -196,6 +200,8 @@ _SERVICES = {
     "slam": ("save", "load", "reset", "relocalize", "pause"),
     "tlca": ("get_map", "get_graphml"),
     "robot": ("pause",),
+    "explorer": ("cancel",),
+    "pilot": ("cancel",),
 }
 """{node: its services beside those of every node}."""
 
@@ -209,7 +215,11 @@ _LIFECYCLE_SERVICES = (
 
 
 def _is_managed(row: NodeRow) -> bool:
-    return isinstance(row, ProcessRow) or "Task" in row.consumes
+    return isinstance(row, ProcessRow) or _is_task_node(row)
+
+
+def _is_task_node(row: NodeRow) -> bool:
+    return "Task" in row.consumes
 
 
 def _services(row: NodeRow) -> tuple[str, ...]:
@@ -248,7 +258,7 @@ def sros2_policy(_configuration: Configuration) -> str:
     """config/sros2_policy.xml: what each node may publish, subscribe to, answer and request, as sros2 reads it."""
     rows = (*node_rows(), RECORDER)
     operator = NodeRow("operator", "a person at the command line or RViz")
-    enclaves = [_enclave(row, (), _services(row)) for row in rows]
+    enclaves = [_enclave(row, (), _services(row), "execute" if _is_task_node(row) else "") for row in rows]
     requests = [f"{row.name}/{service}" for row in rows for service in _services(row)]
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
@@ -256,15 +266,22 @@ def sros2_policy(_configuration: Configuration) -> str:
         "     In the schema of sros2, policy.xsd of version 0.2.0. See docs/guides/security.md. -->",
         '<policy version="0.2.0">',
         "  <enclaves>",
-        *(line for enclave in (*enclaves, _enclave(operator, requests, _services(operator))) for line in enclave),
+        *(
+            line
+            for enclave in (*enclaves, _enclave(operator, requests, _services(operator), "call"))
+            for line in enclave
+        ),
         "  </enclaves>",
         "</policy>",
     ]
     return "\n".join(lines) + "\n"
 
 
-def _enclave(row: NodeRow, requests: Iterable[str], services: Iterable[str]) -> list[str]:
-    """Lines of the enclave of a node."""
+def _enclave(row: NodeRow, requests: Iterable[str], services: Iterable[str], action: str) -> list[str]:
+    """Lines of the enclave of a node.
+
+    :param action: its part in the action of goals: "execute", "call", or empty.
+    """
     return [
         f'    <enclave path="/hmt_slam/{row.name}">',
         "      <profiles>",
@@ -273,6 +290,7 @@ def _enclave(row: NodeRow, requests: Iterable[str], services: Iterable[str]) -> 
         *_rules("topic", "subscribe", _subscriptions(row)),
         *_rules("service", "reply", (f"~/{name}" for name in services)),
         *_rules("service", "request", requests),
+        *(_rules("action", action, ("navigate_to_pose",)) if action else ()),
         "        </profile>",
         "      </profiles>",
         "    </enclave>",

@@ -13,7 +13,18 @@ import hmt_slam_ros
 
 PACKAGE = Path(hmt_slam_ros.__file__).parent
 DOCUMENT = PACKAGE.parent / "docs" / "guides" / "troubleshooting.md"
-SAID_BY = {"HmtSlamError", "DocumentVersionError", "Notice", "_notice", "warn", "warning", "fail", "_end"}
+SAID_BY = {
+    "HmtSlamError",
+    "DocumentVersionError",
+    "GoalError",
+    "Notice",
+    "_notice",
+    "warn",
+    "warning",
+    "fail",
+    "_end",
+    "_fail_task",
+}
 # What these return or keep is findings, results, pictures and documents.
 OTHER = {"doctor", "view", "cli", "evaluation", "plots.py", "documents.py", "doctor_node.py"}
 FEWEST_WORDS, FEWEST_WORDS_KEPT = 4, 7

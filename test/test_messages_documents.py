@@ -39,7 +39,7 @@ from hmt_slam_ros.messages.messages import (
     Notice,
     TrackingReset,
 )
-from hmt_slam_ros.messages.tasks import PlaceEstimate
+from hmt_slam_ros.messages.tasks import PlaceEstimate, TaskFeedback
 from hmt_slam_ros.messages.team import JoinedGround, TeamMessage, Verdict
 from hmt_slam_ros.messages.topology import Topology
 from hmt_slam_ros.plain_data import field_names, is_record
@@ -62,6 +62,7 @@ KINDS = (
     ResetRequest,
     ResetResponse,
     PlaceEstimate,
+    TaskFeedback,
     Ambiguity,
     *get_args(TeamMessage),
     JoinedGround,

@@ -16,8 +16,8 @@ ROOT = Path(__file__).resolve().parent.parent
 LOCKED = ("tested", "ros", "tf2_msgs")
 # Names of rosdep that are not those of PyPI.
 PYPI_NAMES = {"pil": "pillow", "yaml": "pyyaml"}
-# On PyPI nobody has these; tf2_msgs is compiled, the others start and show nodes.
-NOT_ON_PYPI = {"tf2_msgs", "launch", "launch_ros", "ros2launch"}
+# PyPI does not have these; the first two are compiled, the others start and show nodes.
+NOT_ON_PYPI = {"tf2_msgs", "nav2_msgs", "launch", "launch_ros", "ros2launch"}
 
 
 def locked_packages(name):

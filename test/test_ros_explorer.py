@@ -9,13 +9,16 @@ pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, 
 
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import LaserScan
-from std_msgs.msg import String
+from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.messages.documents import decode
+from hmt_slam_ros.messages.tasks import TaskFeedback
 from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import keyframe_frame, pose_from_message
-from hmt_slam_ros.ros.topics import KEYFRAME_SCANS, KEYFRAMES
+from hmt_slam_ros.ros.conversions import keyframe_frame, pose_from_message, pose_message
+from hmt_slam_ros.ros.topics import KEYFRAME_SCANS, KEYFRAMES, TASK_FEEDBACK
 
 WORLD = """
 walls: [[0, -1, 5, -1], [5, -1, 5, 1], [5, 1, 3, 1], [3, 1, 3, 4],
@@ -52,12 +55,18 @@ def system(tmp_path, start, listener):
 
 
 def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listener, system, start):
-    """It also restarts where it was not there when the map was exchanged."""
+    """It also restarts where it was not there when the map was exchanged. Without a task there is none to cancel."""
     outcomes = listener.subscribe(String, "explorer/task_result", topics.LATCHED)
     goals = listener.subscribe(PoseStamped, "goal_pose", topics.STREAM)
     truths = listener.subscribe(PoseStamped, "ground_truth", topics.STREAM)
+    feedback = listener.subscribe(String, TASK_FEEDBACK, topics.STREAM)
     nodes = system()
     listener.until(lambda: outcomes, alive=nodes)
+    reported = [decode(message.data, TaskFeedback) for message in feedback]
+    assert {each.task for each in reported} == {"explore"}
+    assert max(each.distance_remaining or 0.0 for each in reported) > 0.5
+    answer = listener.call(Trigger, "explorer/cancel", Trigger.Request())
+    assert (answer.success, answer.message) == (False, "there is no task to cancel")
     explored = "explore: all is known that can be reached; 0 places were given up"
     assert outcomes[0].data == explored
     path = np.array([pose_from_message(message.pose)[:2] for message in truths])
@@ -65,7 +74,8 @@ def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listene
     assert goals
     assert goals[0].header.frame_id == "map"
     goals_ = listener.node.create_publisher(String, "explorer/task", 10)
-    listener.until(lambda: goals_.get_subscription_count() > 0)
+    poses = listener.node.create_publisher(PoseStamped, "explorer/goal", 10)
+    listener.until(lambda: goals_.get_subscription_count() and poses.get_subscription_count())
     goals_.publish(String(data="go cellar"))
     listener.until(lambda: len(outcomes) > 1, alive=nodes)
     assert outcomes[1].data.startswith("go cellar: there is no such place: choose from")
@@ -75,16 +85,24 @@ def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listene
     goals_.publish(String(data="disambiguate"))
     listener.until(lambda: len(outcomes) > 3, alive=nodes)
     assert outcomes[3].data == "disambiguate: the place is sure"
+    goal = np.array([2.5, 0.0, 0.3])
+    # The first area's frame is where the robot began, the route's first point.
+    pose = pose_message(se2.between(np.array([1.0, 0.0, 0.0]), goal))
+    poses.publish(PoseStamped(header=Header(frame_id="area_0"), pose=pose))
+    listener.until(lambda: len(outcomes) > 4, alive=nodes)
+    x, y = pose.position.x, pose.position.y
+    assert outcomes[4].data == f"navigate to ({x:.2f}, {y:.2f}): the robot is there"
+    np.testing.assert_allclose(pose_from_message(truths[-1].pose), goal, atol=0.25)
 
     *others, explorer, robot = nodes
     assert listener.call(Trigger, "slam/reset", Trigger.Request()).success
-    listener.until(lambda: len(outcomes) > 4, alive=nodes)
+    listener.until(lambda: len(outcomes) > 5, alive=nodes)
     explorer.kill()
     explorer.communicate()
     received = len(outcomes)
     again = start("explorer", laser_pose="[0.0,0.0,0.0]")
     listener.until(lambda: len(outcomes) > received, alive=[*others, robot, again])
-    assert {outcome.data for outcome in outcomes[4:]} == {explored}
+    assert {outcome.data for outcome in outcomes[5:]} == {explored}
 
 
 def test_where_a_part_of_the_map_never_comes_it_ends_with_a_sentence(listener, system, start):

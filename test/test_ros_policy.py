@@ -19,7 +19,8 @@ from hmt_slam_ros.ros.topics import DIAGNOSTICS
 
 ROOT = Path(__file__).resolve().parents[1]
 POLICY = ElementTree.parse(ROOT / "config" / "sros2_policy.xml").getroot()
-QUALIFIERS = {"topics": {"publish", "subscribe"}, "services": {"request", "reply"}}
+QUALIFIERS = {"topics": {"publish", "subscribe"}, "services": {"request", "reply"}, "actions": {"call", "execute"}}
+ACTION = re.compile(r"(.+)/_action/\w+")
 LASER = {"laser_pose": "[0.0,0.0,0.0]"}
 PROCESSES = {name: {} for name in process_names()} | {"slam": LASER}
 COMPANIONS = {
@@ -49,6 +50,7 @@ SOMETIMES = {
         "while the live page is open",
     ),
     "/pose": "goes with hmt/pose",
+    "/navigate_to_pose": "where nav2_msgs is installed, and the node drives",
 }
 """{topic: when a node that may use it does}."""
 
@@ -70,7 +72,7 @@ def permissions():
 
 
 def test_it_has_the_form_of_the_schema():
-    """policy.xsd of sros2: policy/enclaves/enclave/profiles/profile, with topics and services."""
+    """policy.xsd of sros2: policy/enclaves/enclave/profiles/profile, with topics, services and actions."""
     assert (POLICY.tag, POLICY.attrib) == ("policy", {"version": "0.2.0"})
     (enclaves,) = POLICY
     assert enclaves.tag == "enclaves"
@@ -94,6 +96,8 @@ def test_every_node_has_an_enclave_and_only_a_person_requests():
     assert [name for name in rules if rules[name]["request"]] == ["operator"]
     replies = {name for node in (*node_names(), RECORDER.name) for name in rules[node]["reply"]}
     assert rules["operator"]["request"] == replies
+    executed = {name for node in node_names() for name in rules[node]["execute"]}
+    assert rules["operator"]["call"] == executed == {"/navigate_to_pose"}
     assert {"/slam/save", "/slam/load", "/slam/change_state", "/tlca/get_map"} <= replies
 
 
@@ -112,7 +116,12 @@ def used_names(listener, node):
         "reply": graph.get_service_names_and_types_by_node,
         "request": graph.get_client_names_and_types_by_node,
     }
-    return {qualifier: {name for name, _ in query(node, "/")} for qualifier, query in queries.items()}
+    used = {qualifier: {name for name, _ in query(node, "/")} for qualifier, query in queries.items()}
+    replies = used["reply"]
+    used["execute"] = {action[1] for name in replies if (action := ACTION.fullmatch(name))}
+    for names in used.values():
+        names -= {name for name in names if ACTION.fullmatch(name)}
+    return used
 
 
 def assert_permissions(listener, nodes):

@@ -37,7 +37,7 @@ SAID = {f"/{topic.lstrip('/')}" for topic in {*NAMED, *topics.DOCUMENTS.values()
     *("/initialpose", "/cmd_vel", "/rendezvous", "/statement"),  # which are subscribed to
     "/ground_truth",  # of a robot that is driven
     "/hmt/incidents",  # of the page
-    *("/goal_pose", "/pilot/place_estimate"),  # of explorer and pilot
+    *("/goal_pose", "/pilot/place_estimate", "/hmt/task_feedback", "/navigate_to_pose"),  # of explorer and pilot
     "/hmt/notices",  # as there is nothing to complain of
     *("/hmt/ambiguity", "/hmt/ambiguity_goal"),  # as one hypothesis is probable
 }

@@ -35,11 +35,11 @@ class GuardedNode(Node):
 
     def create_subscription(self, msg_type: type, topic: str, callback: Callback, *options: Any, **named: Any) -> Any:  # noqa: ANN401  rclpy's
         """As rclpy's; a message on which the callback raises an error is refused."""
-        return super().create_subscription(msg_type, topic, self._guard(topic, callback), *options, **named)
+        return super().create_subscription(msg_type, topic, self.guard(topic, callback), *options, **named)
 
     def create_service(self, srv_type: type, srv_name: str, callback: Callback, **options: Any) -> Any:  # noqa: ANN401  rclpy's
         """As rclpy's; a request on which the callback raises an error gets the answer as it is by then."""
-        guard = self._guard_coroutine if inspect.iscoroutinefunction(callback) else self._guard
+        guard = self._guard_coroutine if inspect.iscoroutinefunction(callback) else self.guard
         return super().create_service(srv_type, srv_name, guard(srv_name, callback), **options)
 
     def create_timer(self, timer_period_sec: float, callback: Callback, *options: Any, **named: Any) -> Any:  # noqa: ANN401  rclpy's
@@ -55,7 +55,9 @@ class GuardedNode(Node):
 
         return super().create_timer(timer_period_sec, run, *options, **named)
 
-    def _guard(self, name: str, callback: Callback) -> Callback:
+    def guard(self, name: str, callback: Callback) -> Callback:
+        """The callback of a topic, service or action that refuses and counts what it cannot handle."""
+
         @wraps(callback)
         def run(*arguments: Any) -> Any:  # noqa: ANN401  rclpy's
             try:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import Odometry as OdometryMessage
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -18,27 +17,27 @@ from hmt_slam_ros.messages.gate import check_belief
 from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
 from hmt_slam_ros.messages.messages import ClosureDecision, Message, PoseReset, RealTimePose
 from hmt_slam_ros.messages.replica import FIRST_AREA, GlobalPoses, Replica
-from hmt_slam_ros.messages.routing import SUBSCRIPTIONS, Process
+from hmt_slam_ros.messages.routing import SUBSCRIPTIONS
 from hmt_slam_ros.messages.tasks import (
     EXPLORER_TASKS,
     PILOT_TASKS,
+    GoalError,
     GoalPose,
     PlaceEstimate,
     Task,
-    TaskKind,
+    TaskError,
     TaskResult,
     VelocityCommand,
-    parse_task,
 )
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.execution import spin_until
 from hmt_slam_ros.ros.initial_state import InitialState, declare_start_from
 from hmt_slam_ros.ros.laser_mountings import LaserMountings, check_scan_message
-from hmt_slam_ros.ros.lifecycle import ManagedNode
 from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
 from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, OdometryFrames, declare_odometry_frame
 from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_poses
+from hmt_slam_ros.ros.task_interface import TaskHost, TaskInterface, TaskProcess
 from hmt_slam_ros.ros.topics import (
     CMD_VEL,
     GOAL_POSE,
@@ -47,8 +46,6 @@ from hmt_slam_ros.ros.topics import (
     ODOM,
     PLACE,
     SCAN,
-    TASK_GOALS,
-    TASK_RESULTS,
 )
 from hmt_slam_ros.sensors import Odometry
 from hmt_slam_ros.untrusted_input import shorten
@@ -62,16 +59,16 @@ _MISSING_TRANSFORMS = 20
 """Scans without a transform after which that is reported."""
 
 
-class TaskNode(ManagedNode):
+class TaskNode(TaskHost):
     """A node whose process drives the robot on tasks.
 
-    :cvar task_kinds: kinds of tasks.
     :ivar map_frame: name of the map's frame.
     :ivar area_poses: ``map_T_area`` of the areas, from :meth:`configure_node` on.
+    :ivar tasks: how tasks are given and followed, from then on.
     """
 
-    task_kinds: Sequence[TaskKind]
     area_poses: GlobalPoses
+    tasks: TaskInterface
 
     def __init__(self, name: str) -> None:
         """Declare the parameters."""
@@ -90,12 +87,7 @@ class TaskNode(ManagedNode):
         self.enter_startup_states()
         spin_until(self)
 
-    @property
-    def is_driver(self) -> bool:
-        """Whether it publishes velocity commands."""
-        raise NotImplementedError
-
-    def make_process(self, initial_state: InitialState) -> Process:
+    def make_process(self, initial_state: InitialState) -> TaskProcess:
         """The process in an initial state; also sets :attr:`area_poses`.
 
         :raises HmtSlamError: where it cannot start from that.
@@ -112,8 +104,9 @@ class TaskNode(ManagedNode):
         self._gap_checks = 0
         initial_state = InitialState(self, self._start_from, lost=True)
         self._process = self.make_process(initial_state)
+        self._robot_pose: RealTimePose | None = None
         self._commands = self.create_publisher(Twist, CMD_VEL, topics.STREAM) if self.is_driver else None
-        self._result_publisher = self.create_publisher(String, TASK_RESULTS[self._name], topics.LATCHED)
+        self.tasks = TaskInterface(self, self._name, self._process)
         self._goals = self.create_publisher(PoseStamped, GOAL_POSE, topics.STREAM)
         frames = OdometryFrames(self.diagnostics, base_frame=self._base_frame)
         self._mountings = LaserMountings(self, self.diagnostics, frames, self._laser_poses)
@@ -121,7 +114,6 @@ class TaskNode(ManagedNode):
             self.create_subscription(OdometryMessage, ODOM, frames.note, topics.NEWEST)
         self.create_subscription(PoseWithCovarianceStamped, HMT_POSE, self._on_pose, topics.NEWEST)
         self.create_subscription(LaserScan, SCAN, self._on_scan, topics.NEWEST)
-        self.create_subscription(String, TASK_GOALS[self._name], self._on_task, topics.STREAM)
         self._inbox = Inbox(
             self,
             SUBSCRIPTIONS[self._name],
@@ -135,12 +127,29 @@ class TaskNode(ManagedNode):
         self.create_timer(PERIOD, self._check_chain, clock=self.diagnostics.steady_clock)
 
     def deactivate_node(self) -> None:
-        """Stop the robot."""
+        """Stop the robot, and end the drive to a pose."""
+        self.tasks.end_navigation()
+        self.stop_robot()
+
+    def clean_up_node(self) -> None:
+        """Also destroy the action server."""
+        self.tasks.destroy()
+
+    def destroy_node(self) -> None:
+        """Destroy the node with its action server, which rclpy does not count to the node."""
+        if self.is_configured:
+            self.tasks.destroy()
+        super().destroy_node()
+
+    def stop_robot(self) -> None:
+        """Publish a velocity of 0."""
         if self._commands is not None:
             self._commands.publish(Twist())
 
     def on_message(self, message: Message) -> None:
-        """Handle a message of the inbox."""
+        """Handle a message of the inbox, and update the poses of the areas."""
+        if isinstance(message, ClosureDecision) and message.global_poses:
+            self.area_poses = GlobalPoses(message.global_poses)
         self.process_message(message)
 
     def process_message(self, message: Message) -> None:
@@ -158,13 +167,14 @@ class TaskNode(ManagedNode):
                 f"{self._name} could not handle a {kind} ({shorten(repr(fault))}) and goes on without it: report the "
                 "fault with the log"
             )
+        self.tasks.follow(self._process)
 
     def publish_output(self, message: Message) -> None:
         """Publish an output of the process; a goal only where its area has a pose in the map."""
         if isinstance(message, TaskResult):
-            self._result_publisher.publish(String(data=message.text))
-            self.get_logger().info(message.text)
+            self.tasks.publish_result(message)
         elif isinstance(message, VelocityCommand) and self._commands is not None:
+            self.tasks.speed = message.speed
             command = Twist()
             command.linear.x, command.angular.z = message.speed, message.turn_rate
             self._commands.publish(command)
@@ -182,9 +192,10 @@ class TaskNode(ManagedNode):
             self.diagnostics.refuse(HMT_POSE, fault)
             return
         stamp = conversions.stamp_from_time(message.header.stamp)
-        self.process_message(
-            RealTimePose(stamp, area, _UNKNOWN_POSE, belief, _UNKNOWN_POSE, np.zeros(3), np.zeros((3, 3)))
+        self._robot_pose = RealTimePose(
+            stamp, area, _UNKNOWN_POSE, belief, _UNKNOWN_POSE, np.zeros(3), np.zeros((3, 3))
         )
+        self.process_message(self._robot_pose)
 
     def _on_scan(self, message: LaserScan) -> None:
         if not self.is_active:
@@ -196,6 +207,7 @@ class TaskNode(ManagedNode):
             return
         self.diagnostics.received["Scan"] += 1
         if scan is not None:
+            self.tasks.stamp = scan.stamp
             self.process_message(scan)
             return
         self._scans_without_mounting += 1
@@ -206,14 +218,15 @@ class TaskNode(ManagedNode):
         """Start again with the same map as the processes; a task ends with its map."""
         if request.number <= self._reset_number:
             return
-        self.process_message(Task("stop"))
-        self.deactivate_node()
+        self.stop_robot()
         try:
             initial_state = InitialState(self, request.folder, lost=True)
             self._process = self.make_process(initial_state)
         except HmtSlamError as fault:
+            self.process_message(Task("stop"))
             self.diagnostics.fail(f"the map was exchanged, and {self._name} stands still until the next reset: {fault}")
             return
+        self.tasks.follow(self._process)
         self._reset_number = request.number
         self._inbox.reset(initial_state.events, request.number)
         self._inbox.deliver_early()
@@ -230,13 +243,40 @@ class TaskNode(ManagedNode):
             self.deactivate_node()
             raise HmtSlamError(fault)
 
-    def _on_task(self, message: String) -> None:
+    def make_pose_task(self, message: PoseStamped) -> Task:
+        """The task to drive to a pose in the frame of the map or of an area.
+
+        :raises GoalError: where there is no such frame or pose.
+        """
         try:
-            task = parse_task(message.data, self.task_kinds)
+            pose = conversions.pose_from_message(message.pose)
         except HmtSlamError as fault:
-            self.diagnostics.refuse(TASK_GOALS[self._name], fault)
-        else:
-            self.process_message(task)
+            raise GoalError(f"the goal is no pose: {fault}", TaskError.TRANSFORM_ERROR) from fault
+        pose = se2.compose(self._frame_pose(message.header.frame_id), pose)
+        goal = self._process.exploration_map.anchor(self.area_poses, pose)
+        return Task("navigate", f"to ({pose[0]:.2f}, {pose[1]:.2f})", goal)
+
+    def _frame_pose(self, frame: str) -> Float64:
+        """``map_T_frame`` (3,) of the map or of an area.
+
+        :raises GoalError: for another frame.
+        """
+        if frame == self.map_frame:
+            return np.zeros(3)
+        try:
+            return self.area_poses[conversions.area_from_frame(frame)].mean
+        except (HmtSlamError, KeyError):
+            sentence = f"the map has no frame '{shorten(frame)}': give the goal in {self.map_frame}"
+            raise GoalError(sentence, TaskError.TRANSFORM_ERROR) from None
+
+    def pose_in_map(self, stamp: int) -> PoseStamped:
+        """The last pose of the robot in the map; before the first, the map's origin at a stamp, ns."""
+        known = self._robot_pose
+        area = None if known is None else self.area_poses.get(known.area)
+        if known is None or area is None:
+            return PoseStamped(header=conversions.header_message(stamp, self.map_frame))
+        pose = conversions.pose_message(se2.compose(area.mean, known.pose_in_area.mean))
+        return PoseStamped(header=conversions.header_message(known.stamp, self.map_frame), pose=pose)
 
 
 class ExplorerNode(TaskNode):
@@ -249,7 +289,7 @@ class ExplorerNode(TaskNode):
         """Whether it publishes velocity commands."""
         return self.configuration.explorer.drive == "velocities"
 
-    def make_process(self, initial_state: InitialState) -> Process:
+    def make_process(self, initial_state: InitialState) -> TaskProcess:
         """The explorer of a map, or of an unknown building."""
         from hmt_slam_ros.exploration.explorer import Explorer  # noqa: PLC0415  takes time
 
@@ -259,12 +299,6 @@ class ExplorerNode(TaskNode):
         if self.configuration.explorer.explores:
             explorer.handle(Task("explore"))
         return explorer
-
-    def on_message(self, message: Message) -> None:
-        """Handle a message of the inbox, and update the poses of the areas."""
-        if isinstance(message, ClosureDecision) and message.global_poses:
-            self.area_poses = GlobalPoses(message.global_poses)
-        self.process_message(message)
 
 
 class PilotNode(TaskNode):
@@ -285,9 +319,8 @@ class PilotNode(TaskNode):
         super().configure_node()
         self._estimates = self.create_publisher(String, PLACE, topics.LATCHED)
         self._initial_pose_publisher = self.create_publisher(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
-        self._stamp = 0
 
-    def make_process(self, initial_state: InitialState) -> Process:
+    def make_process(self, initial_state: InitialState) -> TaskProcess:
         """The pilot of a map.
 
         :raises HmtSlamError: where there is no map, or one without places.
@@ -307,13 +340,12 @@ class PilotNode(TaskNode):
     def on_message(self, message: Message) -> None:
         """Handle a message of the inbox; an inactive pilot ignores odometry."""
         if self.is_active or not isinstance(message, Odometry):
-            self.process_message(message)
+            super().on_message(message)
 
     def publish_output(self, message: Message) -> None:
         """Publish an output of the pilot; a pose reset as an initial pose in the map."""
         super().publish_output(message)
         if isinstance(message, PlaceEstimate):
-            self._stamp = message.stamp
             self._estimates.publish(String(data=encode(message, system=self.system.name)))
             self.diagnostics.values["place"] = f"{message.place or 'unknown'}, {message.probability:.3f}"
         elif isinstance(message, PoseReset) and message.initial_pose is not None:
@@ -323,5 +355,5 @@ class PilotNode(TaskNode):
         pose = se2.compose(self.area_poses[initial_pose.area].mean, initial_pose.pose.mean)
         belief = PoseGaussian(pose, initial_pose.pose.covariance)
         self._initial_pose_publisher.publish(
-            conversions.pose_with_covariance_message(self._stamp, self.map_frame, belief)
+            conversions.pose_with_covariance_message(self.tasks.stamp, self.map_frame, belief)
         )
