@@ -74,7 +74,7 @@ def test_the_lock_covers_package_xml():
     for element in ElementTree.parse(ROOT / "package.xml").getroot():
         if not element.tag.endswith("_depend") or element.text in NOT_ON_PYPI:
             continue
-        name = element.text.removeprefix("python3-").removesuffix("-pip")
+        name = element.text.removeprefix("python3-")
         is_ros = name == element.text
         assert (f"ros-{name.replace('_', '-')}" if is_ros else PYPI_NAMES.get(name, name)) in packages
 

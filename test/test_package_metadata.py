@@ -153,10 +153,10 @@ def test_every_third_party_import_is_a_declared_dependency(python_packages):
     assert imported - set(sys.stdlib_module_names) - others <= ros | python_packages
 
 
-def test_pip_and_rosdep_request_the_same_python_packages_but_for_numba_which_rosdep_cannot_give(python_packages):
+def test_pip_and_rosdep_request_the_same_python_packages_but_for_those_that_debian_does_not_have(python_packages):
     keys = {str(element.text) for element in package_xml().findall("exec_depend")}
-    rosdep = {key.removeprefix("python3-").removesuffix("-pip") for key in keys if key.startswith("python3-")}
-    assert {name.lower() for name in python_packages} == rosdep | {"numba"}
+    rosdep = {key.removeprefix("python3-") for key in keys if key.startswith("python3-")}
+    assert {name.lower() for name in python_packages} == rosdep | {"numba", "rosbags"}
 
 
 @pytest.mark.parametrize(
