@@ -9,7 +9,7 @@ from small_floor import AREAS, CONFIGURATION, keyframes, make_map, seen_at
 
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.exploration.explorer import ExplorationMap
+from hmt_slam_ros.exploration.exploration_map import ExplorationMap
 from hmt_slam_ros.exploration.pilot import PilotProcess
 from hmt_slam_ros.exploration.pose_goals import anchor_pose
 from hmt_slam_ros.geometry import se2

@@ -307,7 +307,7 @@ def test_a_laser_falls_silent_a_disk_is_full_and_time_jumps_back(listener, start
     for process in nodes.alive[:5]:
         process.send_signal(signal.SIGINT)
     reported = slam.communicate(timeout=20)[1]
-    assert "scans come again, after" in reported
+    assert "scans come again on scan, after" in reported
     assert "time went back by" in reported
     assert "the node goes on, but if it is killed all have to be restarted; make room there" in reported
 

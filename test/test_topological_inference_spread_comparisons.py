@@ -77,6 +77,7 @@ def make_tsbi():
         recheck=lambda _parent, *areas: ("rechecked", *areas),
         find_unlinked_overlap=lambda *_: None,
         leads_elsewhere=lambda _parent: False,
+        statements=SimpleNamespace(due_pair=lambda _parent: None),
     )
     return tsbi
 
@@ -114,7 +115,7 @@ def test_a_search_and_a_comparison_of_a_lost_hypothesis_take_turns(monkeypatch, 
             answers.append(tsbi._branch_without_area_event(parent, estimate, keyframe)[0])
     assert answers == ["compared", ["searched"], *["compared"] * 4]
     unmatched = make_parent(unmatched_keyframes=tuple(range(9)))
-    assert tsbi._branch_without_area_event(unmatched, estimate, keyframe) == ("rechecked",)
+    assert tsbi._branch_without_area_event(unmatched, estimate, keyframe) == ("rechecked", ())
 
 
 def test_keyframes_that_fitted_beside_an_area_are_compared_with_it_once():

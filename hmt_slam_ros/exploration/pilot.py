@@ -20,7 +20,8 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.exploration.explorer import ExplorationMap, Explorer
+from hmt_slam_ros.exploration.exploration_map import ExplorationMap
+from hmt_slam_ros.exploration.explorer import Explorer
 from hmt_slam_ros.exploration.local_motion import MotionCommand
 from hmt_slam_ros.exploration.mission_controller import MissionController, Phase
 from hmt_slam_ros.exploration.path_follower import motion_limits

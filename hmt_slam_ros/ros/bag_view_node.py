@@ -125,7 +125,7 @@ class BagViewNode(ViewNode):
         def deserialize(content: bytes) -> None:
             callback(deserialize_message(content, msg_type))
 
-        subscription = _BagSubscription(self.resolve_topic_name(topic), self._guard(topic, deserialize))
+        subscription = _BagSubscription(self.resolve_topic_name(topic), self.guard(topic, deserialize))
         if self._bag_topics.get(subscription.topic) != _type_name(msg_type):
             return subscription
         self._bag_subscriptions[subscription.topic].append(subscription)

@@ -29,7 +29,7 @@ from hmt_slam_ros.ros.navigation_action import NavigateToPose, NavigationAction
 from hmt_slam_ros.ros.topics import TASK_FEEDBACK, TASK_GOALS, TASK_POSES, TASK_RESULTS
 
 if TYPE_CHECKING:
-    from hmt_slam_ros.exploration.explorer import ExplorationMap
+    from hmt_slam_ros.exploration.exploration_map import ExplorationMap
 
 _FEEDBACK_PERIOD = 0.5
 """Time between two messages of feedback, s."""

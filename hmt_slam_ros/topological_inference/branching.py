@@ -25,7 +25,7 @@ from hmt_slam_ros.hybrid_map.shortest_path import (
 from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions, min_distance
 from hmt_slam_ros.messages.map_changes import Arc
 from hmt_slam_ros.messages.replica import FIRST_AREA, Replica
-from hmt_slam_ros.messages.statements import StatementEvidence, WeighedStatement
+from hmt_slam_ros.messages.statements import StatementEvidence
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.relative_motion import is_wide
 from hmt_slam_ros.topological_inference.area_comparison import (
@@ -54,11 +54,9 @@ from hmt_slam_ros.topological_inference.map_search import MapSearch
 from hmt_slam_ros.topological_inference.marks import AreaMark, MarkEvidence, MarkMemory
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 from hmt_slam_ros.topological_inference.statements import (
+    PlaceStatements,
     StatementQueue,
     area_query,
-    due_pair,
-    reweigh_by_statements,
-    weigh_statements,
 )
 
 MIN_PROPOSAL_PROBABILITY = 0.5
@@ -113,7 +111,7 @@ class Branching:
     :ivar landmarks: their evidence on places and loops, where the configuration asks for it.
     :ivar unstored_scans: {keyframe event: scan} of scans that no map holds and that may still be matched.
     :ivar marks: the visits of marks.
-    :ivar statements: what people stated about places and waits for the next event.
+    :ivar statements: what people stated about places.
     :ivar options: parameters of the inference.
     :ivar kidnapping_priors: of a kidnapping before a keyframe event.
     """
@@ -137,8 +135,7 @@ class Branching:
         self.landmarks = None if landmarks is None else landmarks(configuration, scans)
         self.marks = MarkMemory()
         self._mark_evidence = MarkEvidence(configuration)
-        self.statements = StatementQueue()
-        self._replica, self._statement_evidence = replica, StatementEvidence(configuration.tsbi)
+        self.statements = PlaceStatements(StatementEvidence(configuration.tsbi), replica)
         self.options = configuration.tsbi
         self.kidnapping_priors = KidnappingPriors.from_configuration(configuration)
         self._filter = configuration.filter
@@ -149,7 +146,9 @@ class Branching:
     def state(self) -> BranchingState:
         """What is remembered between two events."""
         search = replace(self.search.state, region_maps=self.map_search.state)
-        return BranchingState(self.entry.largest_area, search, dict(self.unstored_scans), self.marks, self.statements)
+        return BranchingState(
+            self.entry.largest_area, search, dict(self.unstored_scans), self.marks, self.statements.queue
+        )
 
     def restore(self, state: BranchingState) -> None:
         """Start from a saved state."""
@@ -158,7 +157,7 @@ class Branching:
         self.map_search.restore(state.search.region_maps)
         self.unstored_scans.update(state.unstored_scans)
         self.marks = state.marks
-        self.statements = state.statements
+        self.statements.queue = state.statements
 
     def localize_globally(
         self, parent: Parent, search: GlobalSearch, pose_hint: PoseHint | None = None
@@ -240,30 +239,6 @@ class Branching:
             for visit, before in self.marks.beginning_visits(keyframe)
         )
         return replace(parent, log_weight=parent.log_weight + log_likelihood)
-
-    def take_statements(self, event: int) -> list[str]:
-        """Weigh the statements that wait from now on; returns sentences about those that are dropped."""
-        if not self.statements.waiting:
-            return []
-        hybrid_map, known = self._replica.maps[self._replica.best_hypothesis], self._replica.statements
-        self.statements, self._replica.statements, dropped = self.statements.take(known, hybrid_map, event)
-        return dropped
-
-    def reweigh_by_statements(self, parent: Parent) -> Parent:
-        """The hypothesis with the evidence of what people stated."""
-        statements = self._replica.statements
-        return reweigh_by_statements(parent, statements, self._statement_evidence) if statements else parent
-
-    def weigh_statements(self, statements: Sequence[WeighedStatement]) -> list[str]:
-        """Keep statements with their probabilities under the live hypotheses; returns sentences about them."""
-        maps, probabilities = self._replica.maps, self._replica.probabilities
-        weighed, sentences = weigh_statements(statements, maps, probabilities, self._statement_evidence)
-        self._replica.statements = weighed
-        return sentences
-
-    def due_pair(self, parent: Parent) -> StatedPair | None:
-        """The next two areas that a person states to be one place, and that may be compared; None without."""
-        return None if parent.state.is_lost else due_pair(parent, self._replica.statements)
 
     def leads_elsewhere(self, parent: Parent) -> bool:
         """Whether a mark puts keyframes that were not compared into an area that is not joined to the robot's."""

@@ -14,6 +14,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import connected_neighbors
+from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.statements import (
     PlaceStatement,
     StatementEvidence,
@@ -138,17 +139,6 @@ def reweigh_by_statements(
     return replace(parent, log_weight=parent.log_weight + gained, state=state)
 
 
-def due_pair(parent: Parent, statements: Sequence[WeighedStatement]) -> StatedPair | None:
-    """The next two areas that are stated to be one place and may be compared under a hypothesis; None without."""
-    for one in statements:
-        areas = one.areas_in(parent.hybrid_map)
-        if one.statement.kind != "same" or one.number <= parent.state.compared_statement or areas is None:
-            continue
-        if _are_apart(parent.hybrid_map, *areas):
-            return StatedPair(one.number, *areas)
-    return None
-
-
 def _are_apart(hybrid_map: HybridMap, area: int, other: int) -> bool:
     return area != other and other not in connected_neighbors(hybrid_map, area)
 
@@ -161,3 +151,49 @@ def area_query(hybrid_map: HybridMap, area: int, covariance: Float64) -> Query:
     poses = hybrid_map.keyframes(area)
     first = next(iter(poses.values()))
     return Query(PoseGaussian(first, covariance), {k: se2.between(first, pose) for k, pose in poses.items()})
+
+
+class PlaceStatements:
+    """What people stated about places: it weighs hypotheses, and proposes comparisons.
+
+    :ivar queue: the statements that wait for the next event; all others are in the replica.
+    """
+
+    def __init__(self, evidence: StatementEvidence, replica: Replica) -> None:
+        self.queue = StatementQueue()
+        self._evidence, self._replica = evidence, replica
+
+    def add(self, statement: PlaceStatement) -> None:
+        """Let a statement wait for the next event."""
+        self.queue = self.queue.add(statement)
+
+    def take(self, event: int) -> list[str]:
+        """Weigh the statements that wait from now on; returns sentences about those that are dropped."""
+        if not self.queue.waiting:
+            return []
+        hybrid_map, known = self._replica.maps[self._replica.best_hypothesis], self._replica.statements
+        self.queue, self._replica.statements, dropped = self.queue.take(known, hybrid_map, event)
+        return dropped
+
+    def reweigh(self, parent: Parent) -> Parent:
+        """A hypothesis with the evidence of all statements for its map."""
+        statements = self._replica.statements
+        return reweigh_by_statements(parent, statements, self._evidence) if statements else parent
+
+    def weigh(self, statements: Sequence[WeighedStatement]) -> list[str]:
+        """Keep statements with their probabilities under the live hypotheses; returns sentences about them."""
+        maps, probabilities = self._replica.maps, self._replica.probabilities
+        self._replica.statements, sentences = weigh_statements(statements, maps, probabilities, self._evidence)
+        return sentences
+
+    def due_pair(self, parent: Parent) -> StatedPair | None:
+        """The next two areas that are stated to be one place and may be compared under a hypothesis; None without."""
+        if parent.state.is_lost:
+            return None
+        for one in self._replica.statements:
+            areas = one.areas_in(parent.hybrid_map)
+            if one.statement.kind != "same" or one.number <= parent.state.compared_statement or areas is None:
+                continue
+            if _are_apart(parent.hybrid_map, *areas):
+                return StatedPair(one.number, *areas)
+        return None

@@ -199,7 +199,7 @@ class Tsbi:
         elif isinstance(message, ClosureDecision):
             self._accept(message)
         elif isinstance(message, PlaceStatement):
-            self._branching.statements = self._branching.statements.add(message)
+            self._branching.statements.add(message)
         elif isinstance(message, TrackingReset):
             self._reset_event, self._pose_distribution = message.event, None
         return []
@@ -313,11 +313,11 @@ class Tsbi:
     def _take_statements(self, event: int) -> None:
         """Weigh the statements that came since the last event; during a revision they wait for the next one."""
         if not self._state.revised_hypotheses:
-            self._notices += [Notice("tsbi", f"{text}.") for text in self._branching.take_statements(event)]
+            self._notices += [Notice("tsbi", f"{text}.") for text in self._branching.statements.take(event)]
 
     def _weigh_statements(self, statements: tuple[WeighedStatement, ...]) -> tuple[WeighedStatement, ...]:
         """The statements with their probabilities under the surviving hypotheses."""
-        self._notices += [Notice("tsbi", f"{text}.") for text in self._branching.weigh_statements(statements)]
+        self._notices += [Notice("tsbi", f"{text}.") for text in self._branching.statements.weigh(statements)]
         return self._replica.statements
 
     def _move_pruned(self, pruned: Sequence[PrunedKeyframe]) -> dict[int, int]:
@@ -347,7 +347,7 @@ class Tsbi:
         ]
         parents = [
             self._branching.reweight_by_marks(parent, self._estimates[parent.hypothesis].pose, keyframe.sequence)
-            for parent in map(self._branching.reweigh_by_statements, parents)
+            for parent in map(self._branching.statements.reweigh, parents)
         ]
         localized = [
             LocalizedHypothesis(p.hybrid_map, p.area, pose, {p.area, *p.local_area_poses()})
@@ -456,10 +456,10 @@ class Tsbi:
             return branches if keyframe.mapping else accept_relocalization(branches)
         if state.comparison is not None:
             return self._branching.continue_comparison(parent, state.comparison)
-        pair = self._branching.due_pair(parent) if keyframe.mapping else None
+        pair = self._branching.statements.due_pair(parent) if keyframe.mapping else None
         if pair is not None:
             return self._branching.compare_stated(parent, pair)
-        is_retry_due = estimate.stored and bool(state.pending_candidates) and unmatched == _RETRY_KEYFRAMES
+        is_retry_due = bool(state.pending_candidates) and unmatched == _RETRY_KEYFRAMES and estimate.stored
         if is_recheck_due or is_retry_due:
             return self._branching.recheck(parent, () if is_recheck_due else state.pending_candidates)
         return Branches([parent.unchanged_child()])
