@@ -51,10 +51,10 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """The first two workers take the files in which nodes run, the third what only computes.
+    """The first two workers take the files in which nodes run, the others what only computes.
 
-    Nodes mostly wait for each other, so that the third has the rest of the processor. No more than two workers run
-    nodes, which have to react within a time: the third ends where nothing else is left.
+    Nodes mostly wait for each other, so that the others have the rest of the processor. No more than two workers run
+    nodes, which have to react within a time: the others end where nothing else is left.
     """
     from xdist.scheduler import LoadFileScheduling  # noqa: PLC0415  only where it is installed
 
