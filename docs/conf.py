@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import re
 import sys
 from collections.abc import Callable
@@ -62,7 +63,9 @@ if HAS_API:
     extensions += ["sphinx.ext.autodoc", "autoapi.extension"]
     # astroid parses its text of the class ndarray at every annotation that names it, for half of the build's time.
     brain_numpy_ndarray.extract_node = cache(brain_numpy_ndarray.extract_node)
-autoapi_dirs = [str(ROOT / PACKAGE)]
+# Of the whole package, or of one of its folders: the pages of all take most of the time of a build.
+API_FOLDER = os.environ.get("HMT_DOCS_API", "")
+autoapi_dirs = [str(ROOT / PACKAGE / API_FOLDER)]
 autoapi_root = "reference/api"
 autoapi_options = ["members", "undoc-members", "show-module-summary"]
 autoapi_add_toctree_entry = False
@@ -76,6 +79,8 @@ suppress_warnings = [
     "autoapi.python_import_resolution",
     # Two classes of one name.
     "ref.python",
+    # The list of all folders is not made for one.
+    *(["toc.not_included"] if API_FOLDER else []),
 ]
 # Blocks without a language are commands and their output.
 highlight_language = "none"

@@ -45,6 +45,7 @@ def _arguments() -> list[DeclareLaunchArgument]:
             choices=modes,
             description="What is done with known ground; empty for what the YAML file says.",
         ),
+        switch("view_controls", "false", "Whether the live page has buttons, for those who have its token."),
         switch("use_sim_time", "false", "Take the time from /clock, for a replay or a simulator."),
         switch("start_lost", "true", "Whether the robot may be anywhere in that map; else it is where it was."),
         switch("save_on_shutdown", "false", "Whether the map is saved there before the nodes end."),
@@ -67,12 +68,16 @@ def _processes(context: LaunchContext) -> list[OpaqueFunction]:
     return [node(program, parameters, ros_arguments=log_level, **RESPAWN) for program in programs]
 
 
+_VIEW_PARAMETERS = {"port": ("view_port", int), "controls": ("view_controls", bool), "system": ("system", str)}
+"""{parameter of the page: its argument and type}."""
+
+
 def _view() -> Node:
     return Node(
         package=PACKAGE,
         executable="view",
         namespace=LaunchConfiguration("namespace"),
-        parameters=[{"port": value("view_port", int), "system": value("system", str)}],
+        parameters=[{name: value(argument, kind) for name, (argument, kind) in _VIEW_PARAMETERS.items()}],
         remappings=topic_remappings(),
         output="screen",
         condition=IfCondition(LaunchConfiguration("view")),

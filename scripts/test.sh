@@ -13,11 +13,11 @@ check() {
     "$venv/bin/python" -m "$@" || status=1
 }
 
-# Two workers for the tests of nodes, which often wait, and two for those that only compute (test/conftest.py). Nodes have
+# Two workers for the tests of nodes, which often wait, and one for those that only compute (test/conftest.py). Nodes have
 # to react within a time that the other workers may take from them: of these, what fails has to pass alone.
 test_all() {
-    echo "== pytest -n 4"
-    "$venv/bin/python" -m pytest --cache-clear -n 4 --max-worker-restart 2 && return
+    echo "== pytest -n 3"
+    "$venv/bin/python" -m pytest --cache-clear -n 3 --max-worker-restart 2 && return
     "$venv/bin/python" -m pytest -q --collect-only --last-failed --last-failed-no-failures none -m "not nodes"
     [ "$?" = 5 ] || status=1
     echo "the tests of nodes above that failed beside others run once more, alone"

@@ -19,7 +19,7 @@ from hmt_slam_ros.view.server import PageServer
         ({"kind": "save"}, PageCommand("save")),
         ({"kind": "pause", "pose": "ignored"}, PageCommand("pause")),
         ({"kind": "initial_pose", "pose": [1, 2.5, -0.5]}, PageCommand("initial_pose", (1.0, 2.5, -0.5))),
-        ({"kind": "goal", "pose": [1, 2.5, -0.5], "area": 12}, PageCommand("goal", (1.0, 2.5, -0.5), 12)),
+        ({"kind": "goal", "pose": [1, 2.5, -0.5]}, PageCommand("goal", (1.0, 2.5, -0.5))),
         ({"kind": "statement", "statement": "same 3 56"}, PageCommand("statement", statement="same 3 56")),
     ],
 )
@@ -38,8 +38,6 @@ def test_a_command_is_read(content, command):
         ('{"kind":"goal","pose":[1,2]}', "pose = "),
         ('{"kind":"goal","pose":[1,2,true]}', "pose = "),
         ('{"kind":"goal","pose":[1,2,1e9]}', "pose = "),
-        ('{"kind":"goal","pose":[1,2,3],"area":-1}', "area = -1 is none"),
-        ('{"kind":"goal","pose":[1,2,3],"area":"a"}', "area = a is none"),
         ('{"kind":"statement"}', "'None' is no statement about two areas"),
         ('{"kind":"statement","statement":"same 3"}', "'same 3' is no statement about two areas"),
     ],

@@ -15,7 +15,7 @@ from std_srvs.srv import SetBool, Trigger
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import header_message, pose_message, pose_with_covariance_message
-from hmt_slam_ros.ros.topics import GOAL_POSE, INITIAL_POSE, STATEMENT, TASK_GOALS
+from hmt_slam_ros.ros.topics import GOAL_POSE, INITIAL_POSE, STATEMENT, TASK_POSES
 from hmt_slam_ros.untrusted_input import shorten
 from hmt_slam_ros.view.board import Board
 from hmt_slam_ros.view.commands import Commands, PageCommand
@@ -39,7 +39,7 @@ class ViewControls:
         self._pauses = [node.create_client(SetBool, f"{name}/pause") for name in ("robot", "slam")]
         self._initial_poses = node.create_publisher(PoseWithCovarianceStamped, INITIAL_POSE, topics.STREAM)
         self._goals = node.create_publisher(PoseStamped, GOAL_POSE, topics.STREAM)
-        self._tasks = node.create_publisher(String, TASK_GOALS["explorer"], topics.STREAM)
+        self._explorer_goals = node.create_publisher(PoseStamped, TASK_POSES["explorer"], topics.STREAM)
         self._statements = node.create_publisher(String, STATEMENT, topics.STREAM)
 
     def update(self) -> None:
@@ -88,12 +88,13 @@ class ViewControls:
             belief = PoseGaussian(pose, _SPREAD)
             self._initial_poses.publish(pose_with_covariance_message(stamp, self._map_frame(), belief))
             self._tell("good", f"initial pose {place}: the robot is searched near it")
-        elif command.area is not None and self._tasks.get_subscription_count():
-            self._tasks.publish(String(data=f"go area {command.area}"))
-            self._tell("good", f"the explorer goes to area {command.area}")
+            return
+        goal = PoseStamped(header=header_message(stamp, self._map_frame()), pose=pose_message(pose))
+        if self._explorer_goals.get_subscription_count():
+            self._explorer_goals.publish(goal)
+            self._tell("good", f"goal {place}: the explorer drives there, or gives a reason")
         else:
-            header = header_message(stamp, self._map_frame())
-            self._goals.publish(PoseStamped(header=header, pose=pose_message(pose)))
+            self._goals.publish(goal)
             listeners = self._goals.get_subscription_count()
             is_heard = listeners > 1  # the page itself shows goals
             text = f"goal {place}" if is_heard else f"goal {place}: no explorer and no nav2 listens"

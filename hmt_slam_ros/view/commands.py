@@ -26,7 +26,6 @@ MAX_COMMAND = 1000
 _MAX_WAITING = 8
 """Commands that wait; the node takes them five times a second."""
 
-_MAX_AREA = 2**31
 _WITH_POSE = ("initial_pose", "goal")
 
 
@@ -37,13 +36,11 @@ class PageCommand:
     :ivar kind: "save" the map, "pause" or "resume" the run, give the "initial_pose" of the robot, send it to a "goal",
         or make a "statement" about two areas.
     :ivar pose: x, y, m, and heading, rad, in the map, of a pose or goal, else None.
-    :ivar area: the area at a goal, None where there is none.
     :ivar statement: the text of a statement, else empty.
     """
 
     kind: CommandKind
     pose: tuple[float, float, float] | None = None
-    area: int | None = None
     statement: str = ""
 
 
@@ -63,13 +60,11 @@ def parse_command(text: str) -> PageCommand:
         return PageCommand(kind, statement=statement)
     if kind not in _WITH_POSE:
         return PageCommand(kind)
-    pose, area = content.get("pose"), content.get("area")
+    pose = content.get("pose")
     if not isinstance(pose, list) or len(pose) != 3 or not all(_is_coordinate(value) for value in pose):
         raise HmtSlamError(f"pose = {shorten(pose)} is none: give x and y in m and the heading in rad, in the map")
-    if area is not None and not (type(area) is int and 0 <= area < _MAX_AREA):
-        raise HmtSlamError(f"area = {shorten(area)} is none: give the number of an area, or leave it out")
     x, y, theta = map(float, pose)
-    return PageCommand(kind, (x, y, theta), area)
+    return PageCommand(kind, (x, y, theta))
 
 
 def _is_coordinate(value: object) -> bool:

@@ -6,9 +6,8 @@ const $ = (name) => document.getElementById(name);
 const KEY = "token=";
 
 export class Controls {
-  /** With the areas of the map, of which a goal names the nearest one. */
-  constructor(camera, areas) {
-    [this.camera, this.areas, this.wanted, this.pose, this.paused] = [camera, areas, null, null, false];
+  constructor(camera) {
+    [this.camera, this.wanted, this.pose, this.paused] = [camera, null, null, false];
     this.token = decodeURIComponent(location.hash.split(KEY)[1] ?? "");
     $("save").addEventListener("click", () => this.send({ kind: "save" }));
     $("pause").addEventListener("click", () => this.send({ kind: this.paused ? "resume" : "pause" }));
@@ -72,10 +71,7 @@ export class Controls {
   /** Send the pose, or drop it; returns whether there was one. */
   end(isWanted) {
     if (!this.pose) return false;
-    const [x, y] = this.pose;
-    const distance = ({ at }) => Math.hypot(at[0] - x, at[1] - y);
-    const nearest = [...this.areas()].sort((one, other) => distance(one) - distance(other))[0];
-    if (isWanted) this.send({ kind: this.wanted, pose: this.pose, area: nearest?.area ?? null });
+    if (isWanted) this.send({ kind: this.wanted, pose: this.pose });
     this.want(null);
     return true;
   }

@@ -33,7 +33,7 @@ function redraw() {
 }
 
 const walls = new Walls(redraw);
-const controls = new Controls(camera, () => sceneOf(state.graph).areas);
+const controls = new Controls(camera);
 const chart = new Chart($("chart"), (reading) => text($("reading"), reading || "Probability over time; drag to zoom, double click for all"));
 
 // ---- which map is shown
