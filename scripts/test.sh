@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Makes the environment where it is missing and passes the tests.
 # Usage: scripts/test.sh [--floor] [pytest arguments], such as -k NAME for a part of them
-#   Without pytest arguments the accuracy is compared with benchmark/expected.toml after the tests.
+#   Without pytest arguments the long tests are left out (-m long runs them), and the accuracy is compared with
+#   benchmark/expected.toml after the tests.
 #   --floor  with the oldest versions supported (requirements/floor.txt), in .venv-floor, without ruff and mypy
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -17,7 +18,7 @@ check() {
 # to react within a time that the other workers may take from them: of these, what fails has to pass alone.
 test_all() {
     echo "== pytest -n 3"
-    "$venv/bin/python" -m pytest --cache-clear -n 3 --max-worker-restart 2 && return
+    "$venv/bin/python" -m pytest --cache-clear -n 3 --max-worker-restart 2 -m "not long" && return
     "$venv/bin/python" -m pytest -q --collect-only --last-failed --last-failed-no-failures none -m "not nodes"
     [ "$?" = 5 ] || status=1
     echo "the tests of nodes above that failed beside others run once more, alone"

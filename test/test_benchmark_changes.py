@@ -68,6 +68,7 @@ def test_what_falls_short_is_reported():
     )
 
 
+@pytest.mark.long
 def test_two_visits_are_measured():
     found = visit_twice("office", 1000, size=0.7, rate=1.5)
     assert found.new > 0.5
@@ -77,6 +78,7 @@ def test_two_visits_are_measured():
     assert found.error < 0.1
 
 
+@pytest.mark.long
 def test_localization_leaves_the_map_as_it_was_and_follows_the_robot_through_all_of_it():
     found = localize_again("busy", 0, size=0.7, rate=3.0)
     assert found.same

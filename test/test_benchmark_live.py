@@ -17,6 +17,7 @@ def test_messages_before_the_first_answer_are_not_missing():
     assert count_unanswered(MessageTimes({1: 10.0, 2: 11.0, 3: 12.0, 4: 13.0}, {2: 11.5, 4: 13.5})) == 1
 
 
+@pytest.mark.long
 def test_a_laser_with_forty_scans_a_second_is_kept_up_with():
     times = measure_scans(FAST, seconds=6.0).final
     assert len(times.sent) == len(times.delays) == 241
@@ -24,6 +25,7 @@ def test_a_laser_with_forty_scans_a_second_is_kept_up_with():
     assert times.delays[-20:].min() < max(0.3, times.delays.max() - 0.5), times.delays
 
 
+@pytest.mark.long
 def test_estimates_do_not_wait_for_slow_topology():
     times = measure_scans(BUSY, 6.0, SLOW_TSBI)
     assert len(times.first.sent) == len(times.final.delays) == len(times.first.delays)

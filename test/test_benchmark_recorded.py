@@ -239,6 +239,7 @@ class TestMappedWorld:
         assert displace(office, draw_splice(office, number)).document == found.document
 
 
+@pytest.mark.long
 def test_the_bundled_log_is_measured_and_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
     options = ["recorded", "--logs", BUNDLED, "--seeds", "2", "--jobs", "1", "--runs", str(tmp_path / "runs")]
     assert main([*options, "--out", str(tmp_path / "one")]) in (0, 1)

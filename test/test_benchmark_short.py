@@ -64,6 +64,7 @@ def without_datasets(tmp_path, monkeypatch):
     monkeypatch.setenv("HMT_SLAM_DATASETS", str(tmp_path / "none"))
 
 
+@pytest.mark.long
 def test_a_regression_of_the_bundled_log_fails_the_command(tmp_path, monkeypatch, without_datasets):
     """The whole command, on the real log, against a record that is stricter in one figure."""
     record = EXPECTED.read_text()

@@ -18,6 +18,7 @@ def run_map(*arguments):
     return main(["map", *map(str, arguments)])
 
 
+@pytest.mark.long
 def test_robots_of_one_building_have_one_map_and_each_its_own(tmp_path, capsys):
     out = tmp_path / "out"
     words = ("--seed", "50", "--duration", "110", "--set", "team.uses_ground=true")
@@ -47,6 +48,7 @@ def test_robots_of_one_building_have_one_map_and_each_its_own(tmp_path, capsys):
     assert run_map(FIRST, SECOND, "--team", "--duration", "10", "--out", out) == 0
 
 
+@pytest.mark.long
 def test_nodes_of_two_robots_replay_their_logs_at_once(tmp_path, capsys):
     pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
     out = tmp_path / "out"

@@ -212,6 +212,7 @@ def way_to(own: _Explored, place: str) -> list[int]:
     return atlas.roadmap.shortest_path(here.keyframe, atlas.named_places()[place])
 
 
+@pytest.mark.long
 def test_it_drives_to_where_a_look_decides_until_the_place_is_sure() -> None:
     own = explore(2)
     assert completed_task(own.run.run_task(Task("disambiguate"), 5.0)).text == "disambiguate: the place is sure"

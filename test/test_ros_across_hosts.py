@@ -29,6 +29,7 @@ def link(domain, monkeypatch):
         yield link
 
 
+@pytest.mark.long
 def test_the_map_is_that_of_one_host(link, domain, start, tmp_path):
     log, out, saved = corridor_bag(tmp_path, scans=SCANS), tmp_path / "out", tmp_path / "saved"
     hmt_slam("map", log, "--out", out, check=True)

@@ -105,6 +105,7 @@ def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listene
     assert {outcome.data for outcome in outcomes[5:]} == {explored}
 
 
+@pytest.mark.long
 def test_where_a_part_of_the_map_never_comes_it_ends_with_a_sentence(listener, system, start):
     """Slam comes back without what it sent before its last checkpoint, and the explorer did not receive that."""
     keyframes = listener.subscribe(String, KEYFRAMES, topics.CHAIN)

@@ -353,6 +353,7 @@ def joints(messages):
     return {(joint.header.frame_id, joint.child_frame_id) for message in messages for joint in message.transforms}
 
 
+@pytest.mark.long
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed: run scripts/test.sh, which builds it")
 def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_that_is_configured_so(
     listener, start, tmp_path

@@ -98,6 +98,7 @@ def test_poses_go_on_while_topology_does_not_answer(corridor, listener, start):
     assert rest.startswith("0 of them then in another area")
 
 
+@pytest.mark.long
 def test_of_a_live_laser_fewer_scans_are_accepted_the_more_wait_for_topology(listener, start):
     nodes = Nodes(start, listener, laser_pose=LASER.tolist())
     early = nodes.subscribe(String, DOCUMENTS[EarlyEstimate], topics.STREAM)

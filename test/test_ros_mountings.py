@@ -103,6 +103,7 @@ def test_a_transform_that_is_none_leaves_those_beside_it(listener, start):
     laser.until("refused on tf_static", 2)
 
 
+@pytest.mark.long
 def test_scans_of_unknown_frames_hold_up_those_of_known_ones_for_a_while_only(listener, start):
     laser = Laser(listener, start)
     laser.join(joint())

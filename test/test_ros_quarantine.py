@@ -152,6 +152,7 @@ def test_a_journal_with_inputs_that_are_none_is_recovered_again_and_again(node, 
         node.kill()
 
 
+@pytest.mark.long
 def test_a_journal_with_an_input_on_which_the_process_fails_is_recovered_once_and_left_behind(node, tmp_path):
     node.start()
     node.send(0)

@@ -135,6 +135,7 @@ def test_the_nodes_correct_scans_of_two_lasers_for_the_motion_during_their_sweep
         assert (nodes / name).read_bytes() == (lock_step / name).read_bytes()
 
 
+@pytest.mark.long
 def test_the_nodes_have_two_areas_become_one_and_forget_keyframes_as_the_lock_step_run_does(map_twice):
     name, settings = "sim:grid,size=0.7,rate=1,laps=2", ("robot.duration=250.0", "aam.keyframes_per_place=1")
     run = LockStepRun(load_configuration(settings=settings))
@@ -234,6 +235,7 @@ def test_a_run_that_is_killed_takes_its_nodes_with_it(running):
     wait_until(lambda: not any(is_alive(pid) for pid in nodes.values()))
 
 
+@pytest.mark.long
 def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path, preloaded_nodes):
     log, out = corridor_bag(tmp_path, 200), tmp_path / "out"
 
@@ -246,6 +248,7 @@ def test_a_run_that_stands_still_names_the_node_it_waits_for(tmp_path, preloaded
     assert not any(is_alive(pid) for pid in preloaded_nodes.values())
 
 
+@pytest.mark.long
 def test_the_live_page_of_a_run_is_served_while_it_lasts_though_it_is_killed_unless_its_port_is_taken(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

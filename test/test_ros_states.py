@@ -79,6 +79,7 @@ def estimates_of(nodes, since):
     return [message.data for message in nodes.estimates[since:]]
 
 
+@pytest.mark.long
 def test_nodes_that_are_halted_and_taken_down_amid_a_drive_come_to_the_same_as_others(listener, start, tmp_path):
     log, saved = corridor_bag(tmp_path, scans=SCANS), tmp_path / "hmt_map"
     manager, nodes = Manager(listener), Nodes(start, listener, autostart=False, save_to=saved, save_on_shutdown=True)
@@ -195,6 +196,7 @@ def test_a_node_that_cannot_be_configured_says_why_and_stays(listener, start, tm
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 def test_a_node_that_is_killed_comes_back_in_the_state_in_which_it_was(listener, start, tmp_path):
     reported, manager = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM), Manager(listener)
     node = start("rtl", recovery=tmp_path)

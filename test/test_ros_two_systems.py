@@ -120,6 +120,7 @@ def test_a_launch_that_was_left_running_and_a_second_one_name_each_other_at_once
     assert set(others().values()) == ({one, two} if one else {"without a name"})
 
 
+@pytest.mark.long
 def test_systems_without_names_are_detected_by_their_publishers(listener, start):
     reports = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     nodes = [start("rtl"), start("rtl")]

@@ -51,6 +51,7 @@ def search_parts(*shares):
     return search, steps
 
 
+@pytest.mark.long
 def test_maps_that_grow_end_as_if_they_had_been_compared_whole():
     grown, _ = search_parts((0.3, 0.2), (0.3, 0.6), (1.0, 0.8), (1.0, 1.0))
     whole, _ = search_parts((1.0, 1.0))

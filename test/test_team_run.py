@@ -259,6 +259,7 @@ def _rigid_fit(points, others):
     return v.T @ np.diag([1.0, np.linalg.det(v.T @ u.T)]) @ u.T, mean, center
 
 
+@pytest.mark.long
 def test_a_robot_goes_on_in_the_ground_of_another_one():
     """Each drives a good lap, from opposite sides. It stores fewer keyframes, and its map is as accurate as alone."""
     world = "sim:office,seed=51,laps=4,people=0"

@@ -1,5 +1,7 @@
 """A fault at calls that write: what is there afterwards is the old, or the new, and the next run clears the rest."""
 
+import pytest
+
 from benchmark.write_faults.measurement import OPERATIONS, try_operations
 
 FULL_DISK, KILLED_AFTER, NO_EXCHANGE = "0", "5", "8"
@@ -25,6 +27,7 @@ def test_a_faulty_disk_that_cannot_exchange_two_names_leaves_the_old_or_the_new(
     assert found["breaches"] == []
 
 
+@pytest.mark.long
 def test_a_full_disk_or_a_kill_leaves_the_old_or_the_new_of_a_command(fuzz_seeds, tmp_path):
     found = try_operations(tmp_path, fuzz_seeds, COMMANDS, "--every", "60", "--faults", FULL_DISK, KILLED_AFTER)
     assert min(found["trials"].values()) >= 6
