@@ -18,7 +18,14 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.documents import KeyframeHeader, decode, encode
 from hmt_slam_ros.messages.messages import Keyframe
-from hmt_slam_ros.messages.team import SharedArea, TeamPlacement, TeamRequest, TeamStatus, TeamUpdate, Verdict
+from hmt_slam_ros.messages.team import (
+    SharedArea,
+    TeamPlacement,
+    TeamRequest,
+    TeamStatus,
+    TeamUpdate,
+    Verdict,
+)
 from hmt_slam_ros.offline.lock_step import LockStepRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
@@ -205,7 +212,11 @@ def test_what_is_no_message_of_a_team_is_refused_by_name(team, listener):
     empty = TeamUpdate("ann", "1", 0, 1, (), (), True, NO_CLUTTER)
     area = SharedArea(1, 0, (0, 0), (np.zeros(3), np.zeros(3)), ())
     strange = {
-        TeamStatus: [encode(TeamStatus("bob", "another", 1, "0")), "{}", encode(TeamStatus("", "1", 1, "0"))],
+        TeamStatus: [
+            encode(TeamStatus("bob", "another", 1, "0", 0.0)),
+            "{}",
+            encode(TeamStatus("", "1", 1, "0", 0.0)),
+        ],
         TeamRequest: [encode(TeamRequest("ann", "bob", "1", 0)).replace('"version":1', '"version":7')],
         TeamUpdate: [
             encode(replace(empty, clutter=Clutter(1.5, 0.0))),

@@ -13,6 +13,7 @@ from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.team.placement import (
     PlacementGeometry,
+    PlacementPrior,
     WindowCandidate,
     placement_distribution,
     window_candidates,
@@ -51,19 +52,21 @@ def match(windows, window, log_ratio, area=0, placement=TURNED, shift=(0.0, 0.0,
 
 
 FITS = WindowEvidence(5.0, True)
+UNIQUE = -50.0  # log Bayes factor of a building that repeats itself, nats
 
 
 def no_contradictions(*_):
     return None
 
 
-def distribution(geometry, candidates, compare=no_contradictions):
-    return placement_distribution(geometry, candidates, (0, 10), AREAS, compare)
+def distribution(geometry, candidates, compare=no_contradictions, log_repetition=UNIQUE):
+    prior = PlacementPrior.of_pair(AREAS, WINDOWS, log_repetition)
+    return placement_distribution(geometry, candidates, (0, 10), prior, compare)
 
 
 def odds(found):
     """Log-odds of each placement to the prior weight of all that is not one of them."""
-    prior = 0.5 / (AREAS * WINDOWS)
+    prior = 0.5 / PlacementPrior.of_pair(AREAS, WINDOWS).possible
     rest = math.log(found.apart / (1.0 - prior * len(found.placements)))
     return [math.log(each.probability / prior) - rest for each in found.placements]
 
@@ -139,6 +142,21 @@ def test_contradictions_count_in_full():
     found = distribution(geometry, [[match(windows, 0, 5.0)], [match(windows, 1, 5.0)], []], contradict)
     without = distribution(geometry, [[match(windows, 0, 5.0)], [match(windows, 1, 5.0)], []])
     assert odds(found) == pytest.approx([odds(without)[0] - 7.0], abs=0.3)
+
+
+def test_a_building_that_repeats_itself_bounds_the_probability_of_a_placement():
+    geometry, windows = two_rows()
+    sure = [[match(windows, w, 50.0)] for w in range(WINDOWS)]
+    bounds = {r: distribution(geometry, sure, log_repetition=r).best.probability for r in (-1.0, 0.0, 5.0)}
+    assert bounds[-1.0] > bounds[0.0] == pytest.approx(1.0 / 1.003, abs=1e-4)
+    odds_of_twins = 0.003 * math.exp(5.0)
+    assert bounds[5.0] == pytest.approx(1.0 / (1.0 + odds_of_twins / (1.0 + odds_of_twins)), abs=1e-3)
+
+
+def test_before_much_is_mapped_common_ground_is_improbable():
+    geometry, windows = two_rows()
+    found = distribution(geometry, [[match(windows, 0, 2.5)], [], []])
+    assert found.best.probability < 0.45
 
 
 def test_windows_are_compared_where_the_placement_has_them():

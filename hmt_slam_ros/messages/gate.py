@@ -32,6 +32,7 @@ from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe
 from hmt_slam_ros.messages.statements import check_statement
 from hmt_slam_ros.messages.system_name import SystemName
 from hmt_slam_ros.messages.team import (
+    MAX_LOG_REPETITION,
     MAX_TEAM_AREAS,
     MAX_TEAM_KEYFRAMES,
     JoinedGround,
@@ -40,6 +41,7 @@ from hmt_slam_ros.messages.team import (
     TeamMessage,
     TeamPlacement,
     TeamRendezvous,
+    TeamStatus,
     TeamUpdate,
 )
 from hmt_slam_ros.plain_data import field_names, is_record
@@ -297,7 +299,10 @@ def _check_team_message(message: TeamMessage | JoinedGround) -> None:
             _require(message.after < item.version <= message.until, "version", item.version, "one of the update")
         for rate in message.clutter:
             _require(0.0 <= rate <= 1.0, "clutter", rate, "between 0 and 1")
-    if isinstance(message, TeamUpdate | JoinedGround):
+    if isinstance(message, TeamStatus):
+        ratio, most = message.log_repetition, MAX_LOG_REPETITION
+        _require(abs(ratio) <= most, "log_repetition", ratio, f"within {most:g}")
+    elif isinstance(message, TeamUpdate | JoinedGround):
         _check_items(message.scans, message.areas)
     elif isinstance(message, TeamRendezvous):
         _require(message.other != message.robot, "other", message.other, "another robot")

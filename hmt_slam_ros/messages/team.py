@@ -13,6 +13,9 @@ from hmt_slam_ros.sensors import Scan
 MAX_TEAM_AREAS, MAX_TEAM_KEYFRAMES = 2**16, 2**32
 """Bounds of the numbers of areas and keyframes in the map of a robot of a team."""
 
+MAX_LOG_REPETITION = 50.0
+"""Largest log Bayes factor of a building that repeats itself, nats: its exponential stays finite."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SharedScan:
@@ -58,12 +61,14 @@ class TeamStatus:
     :ivar session: of its map; versions of another session are not comparable.
     :ivar map_version: 0 for an empty map.
     :ivar digest: of all items of that version, hexadecimal.
+    :ivar log_repetition: log Bayes factor of a building that repeats itself, from this map in itself, nats.
     """
 
     robot: str
     session: str
     map_version: int
     digest: str
+    log_repetition: float
 
 
 @dataclass(frozen=True, slots=True)

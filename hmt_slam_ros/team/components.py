@@ -27,24 +27,34 @@ class Component:
     :ivar hybrid_map: its areas and arcs; it is not changed.
     :ivar scans: {keyframe: scan} of its keyframes.
     :ivar clutter: usual rate of contradictions of the map.
+    :ivar log_repetition: log Bayes factor of a building that repeats itself, from this map in itself, nats.
     """
 
     hybrid_map: HybridMap
     scans: Mapping[int, Scan]
     clutter: Clutter = NO_CLUTTER
+    log_repetition: float = 0.0
 
     @classmethod
-    def of_map(cls, hybrid_map: HybridMap, scans: Mapping[int, Scan], clutter: Clutter = NO_CLUTTER) -> Component:
+    def of_map(
+        cls,
+        hybrid_map: HybridMap,
+        scans: Mapping[int, Scan],
+        clutter: Clutter = NO_CLUTTER,
+        log_repetition: float = 0.0,
+    ) -> Component:
         """The component of a whole map.
 
         :param scans: of its keyframes at least.
         :param clutter: usual rate of contradictions of the map.
+        :param log_repetition: that of a building that repeats itself, nats.
         """
         areas = hybrid_map.area_ids()
         return cls(
             hybrid_map.subgraph(areas),
             {keyframe: scans[keyframe] for area in areas for keyframe in hybrid_map.keyframes(area)},
             clutter,
+            log_repetition,
         )
 
 
@@ -66,6 +76,7 @@ class ComponentPair:
     :ivar first_keyframe: number from which on keyframes are those of the second.
     :ivar area_shift: added to the numbers of the second's areas.
     :ivar clutters: usual rates of contradictions of the first and of the second.
+    :ivar log_repetition: log Bayes factor of a building that repeats itself, from both maps, nats.
     """
 
     hybrid_map: HybridMap
@@ -75,6 +86,7 @@ class ComponentPair:
     first_keyframe: int
     area_shift: int
     clutters: tuple[Clutter, Clutter]
+    log_repetition: float
 
     @property
     def joint(self) -> tuple[int, int]:
@@ -93,7 +105,7 @@ class ComponentPair:
     def as_one(self, hybrid_map: HybridMap) -> Component:
         """Both as one component, with another hybrid map, and the larger of the rates."""
         clutter = Clutter(*(max(rates) for rates in zip(*self.clutters, strict=True)))
-        return Component(hybrid_map, self.scans, clutter)
+        return Component(hybrid_map, self.scans, clutter, self.log_repetition)
 
 
 def combine(first: Component, second: Component, shifts: Shift | None = None) -> ComponentPair:
@@ -113,8 +125,9 @@ def combine(first: Component, second: Component, shifts: Shift | None = None) ->
     combined.set_arc(areas[0], others[0], place, closure=False)
     combined.commit()
     scans = dict(first.scans) | {keyframe + keyframe_shift: scan for keyframe, scan in second.scans.items()}
-    clutters = first.clutter, second.clutter
-    return ComponentPair(combined, scans, tuple(areas), tuple(others), keyframe_shift, area_shift, clutters)
+    clutters, log_repetition = (first.clutter, second.clutter), first.log_repetition + second.log_repetition
+    known, other = tuple(areas), tuple(others)
+    return ComponentPair(combined, scans, known, other, keyframe_shift, area_shift, clutters, log_repetition)
 
 
 def renumber(hybrid_map: HybridMap, area_shift: int, keyframe_shift: int) -> HybridMap:

@@ -19,6 +19,7 @@ from hmt_slam_ros.messages.team import Verdict
 from hmt_slam_ros.team.components import Component, ComponentPair, combine
 from hmt_slam_ros.team.placement import Placement, PlacementDistribution, is_same_placement
 from hmt_slam_ros.team.placement_search import PlacementSearch
+from hmt_slam_ros.team.repetition import add_repetition
 from hmt_slam_ros.team.windows import Window
 
 MIN_WINDOWS = 2
@@ -54,6 +55,7 @@ class Meeting:
 
 def meet(first: Component, second: Component, configuration: Configuration) -> Meeting:
     """Find how the second component lies in the first, and join them where that is sure."""
+    first, second = add_repetition(first, configuration), add_repetition(second, configuration)
     pair, search = combine(first, second), PlacementSearch(configuration)
     search.update(pair)
     while search.step():

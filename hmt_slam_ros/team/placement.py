@@ -5,10 +5,13 @@ Candidates of several windows that imply the same one, as far as the arcs betwee
 
     log P(H) = log prior + l_best + S(H) - max(0, S_2)
 
+    log P(apart) = log(prior + beta sum over H of P(H))
+
 with l the log Bayes factor of a window, relative to ground that the first component does not have, and S(H) the
 evidence of the other windows (:mod:`hmt_slam_ros.team.placement_evidence`). Of two placements one at least is false:
 the second largest S shows how far false ones agree in this building, and is no evidence
-(docs/decisions/0070-joining-two-maps.md).
+(docs/decisions/0070-joining-two-maps.md). beta is the probability of a building that repeats itself, so that what looks
+like the first component's ground may be its twin (:mod:`hmt_slam_ros.team.repetition`).
 """
 
 from __future__ import annotations
@@ -39,6 +42,12 @@ Pose = Float64
 
 APART_PRIOR = 0.5
 """Prior probability that two components show no common ground, or none by which they could be joined."""
+
+UNSEEN_AREAS = 2
+"""Areas of a building that a component lacks, a priori: robots that begin in it are rarely at one place."""
+
+_REPETITION_PRIOR = 0.003
+"""Prior odds of a building that repeats itself, so that ground has a twin (docs/decisions/0085-repetition.md)."""
 
 _GATE = chi_square_gate(0.999)
 """Squared Mahalanobis distance up to which candidates of two windows agree."""
@@ -77,6 +86,28 @@ class WindowCandidate(NamedTuple):
     area: int
     belief: PoseGaussian
     log_ratio: float
+
+
+class PlacementPrior(NamedTuple):
+    """What is known of placements before any window was compared.
+
+    :ivar possible: number of placements over which the prior is flat.
+    :ivar twin: probability of a building that repeats itself, so that ground of the first component has a twin.
+    """
+
+    possible: int
+    twin: float
+
+    @classmethod
+    def of_pair(cls, known_areas: int, windows: int, log_repetition: float = 0.0) -> PlacementPrior:
+        """The prior that is flat over the areas of a building for each window.
+
+        :param known_areas: number of areas of the first component.
+        :param windows: number of windows of the second.
+        :param log_repetition: log Bayes factor of a building that repeats itself, nats.
+        """
+        odds = _REPETITION_PRIOR * math.exp(log_repetition)
+        return cls((known_areas + UNSEEN_AREAS) * max(1, windows), odds / (1.0 + odds))
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,19 +252,15 @@ def placement_distribution(
     geometry: PlacementGeometry,
     candidates: Sequence[Sequence[WindowCandidate]],
     joint: tuple[int, int],
-    known_areas: int,
+    prior: PlacementPrior,
     compare: Comparison,
 ) -> PlacementDistribution:
     """The PMF over placements, from the candidates of all windows.
 
-    The prior is flat over the areas of the first component for each window of the second.
-
     :param candidates: of each window.
     :param joint: areas of the first and of the second component whose frames are those of the components.
-    :param known_areas: number of areas of the first component.
     """
-    possible = max(1, known_areas * len(candidates))
-    grown = _grow_placements(geometry, candidates, min(possible, _MAX_PLACEMENTS))
+    grown = _grow_placements(geometry, candidates, min(prior.possible, _MAX_PLACEMENTS))
     windows = [_window_evidence(geometry, each, compare) for each in grown]
     placements = []
     for n, (each, own) in enumerate(zip(grown, windows, strict=True)):
@@ -241,18 +268,19 @@ def placement_distribution(
         pose = geometry.component_pose(*joint, next(iter(matches.values())))
         similar = similar_probability(windows[:n] + windows[n + 1 :])
         placements.append(Placement(pose, matches, placement_evidence(own, similar)))
-    return weigh_placements(placements, possible)
+    return weigh_placements(placements, prior)
 
 
-def weigh_placements(placements: Sequence[Placement], possible: int) -> PlacementDistribution:
+def weigh_placements(placements: Sequence[Placement], prior: PlacementPrior) -> PlacementDistribution:
     """The PMF from the evidence of placements.
 
-    :param possible: number of placements over which the prior is flat, at least those that are given.
+    Where the building repeats itself, a twin of the ground that the first component has explains a placement as well.
     """
-    prior = (1.0 - APART_PRIOR) / possible
+    share = (1.0 - APART_PRIOR) / prior.possible
     false_agreement = sorted([0.0, 0.0, *(each.evidence.agreement for each in placements)])[-2]
-    logs = np.array([math.log(prior) + sum(each.evidence) - false_agreement for each in placements])
-    weights = scipy.special.softmax(np.append(logs, math.log(1.0 - prior * len(placements)))).tolist()
+    logs = np.array([math.log(share) + sum(each.evidence) - false_agreement for each in placements])
+    apart = np.append(logs + math.log(prior.twin), math.log(1.0 - share * len(placements)))
+    weights = scipy.special.softmax(np.append(logs, scipy.special.logsumexp(apart))).tolist()
     weighed = [replace(each, probability=p) for each, p in zip(placements, weights[:-1], strict=True)]
     return PlacementDistribution(tuple(sorted(weighed, key=lambda each: -each.probability)), weights[-1])
 

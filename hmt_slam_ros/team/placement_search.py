@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from hmt_slam_ros.configuration.tree import Configuration
@@ -12,6 +12,7 @@ from hmt_slam_ros.team.contradictions import PlaceComparison
 from hmt_slam_ros.team.placement import (
     PlacementDistribution,
     PlacementGeometry,
+    PlacementPrior,
     WindowCandidate,
     placement_distribution,
     window_candidates,
@@ -24,6 +25,8 @@ from hmt_slam_ros.topological_inference.map_search import MapSearch
 
 Keyframes = tuple[int, ...]
 
+Exclusion = Callable[[ComponentPair], Callable[[Window], frozenset[int]]]
+"""Of a pair: the areas of the first component in which each window is not searched."""
 
 _FIRST_REGIONS, _REGIONS = 64, 16
 """Most areas in which a window is searched: at first, and each time the first component has grown.
@@ -38,12 +41,14 @@ class _WindowSearch:
 
     :ivar search: of its keyframes in the first component, None before it began.
     :ivar known: {area: its keyframes} when it began or went on.
+    :ivar excluded: areas that are not searched.
     :ivar left: number of areas that are not to be searched.
     :ivar is_checked: whether the walls of the candidates were checked.
     """
 
     search: GlobalSearch | None = None
     known: Mapping[int, Keyframes] = field(default_factory=dict)
+    excluded: frozenset[int] = frozenset()
     left: int = 0
     is_checked: bool = False
 
@@ -51,8 +56,9 @@ class _WindowSearch:
 class PlacementSearch:
     """Searches every window of the second component in every area of the first, each once while it stays as it is."""
 
-    def __init__(self, configuration: Configuration) -> None:
-        self._configuration = configuration
+    def __init__(self, configuration: Configuration, exclusion: Exclusion | None = None) -> None:
+        """:param exclusion: of a pair: the areas in which each window is not searched."""
+        self._configuration, self._exclusion = configuration, exclusion
         self._scans: dict[int, Scan] = {}
         self._work = EventWork()
         self._map_search = MapSearch(configuration, self._scans, self._work)
@@ -89,23 +95,33 @@ class PlacementSearch:
         self._known = self._known if known == self._known else known
         earlier, windows = self._searches, {tuple(window.poses): window for window in self._windows}
         self._searches = {key: earlier.get(key, _WindowSearch()) for key in windows}
-        self._outdated = {key: w for key, w in windows.items() if self._searches[key].known is not self._known}
+        exclude = self._exclusion(pair) if self._exclusion else _exclude_nothing
+        self._excluded = {key: exclude(window) for key, window in windows.items()}
+        self._outdated = {key: w for key, w in windows.items() if self._is_outdated(key)}
+
+    def _is_outdated(self, window: Keyframes) -> bool:
+        earlier = self._searches[window]
+        return earlier.known is not self._known or earlier.excluded != self._excluded[window]
 
     def _continue_search(self, window: Window, earlier: _WindowSearch) -> _WindowSearch:
         """The search of a window with the areas that are new or have other keyframes still to be searched."""
-        pair, known = self.pair, self._known
+        pair, known, excluded = self.pair, self._known, self._excluded[tuple(window.poses)]
         search = self._map_search.begin(pair.hybrid_map, window.poses, pair.first_keyframe)
+        search = _without_areas(search, excluded)
         if earlier.search is None:
-            return _WindowSearch(search, known, max(0, len(search.unexamined) - _FIRST_REGIONS))
-        examined = {
-            area
-            for area, keyframes in known.items()
-            if earlier.known.get(area) == keyframes and area not in earlier.search.unexamined
-        }
+            return _WindowSearch(search, known, excluded, max(0, len(search.unexamined) - _FIRST_REGIONS))
+        left = {*earlier.search.unexamined, *earlier.excluded, *excluded}
+        examined = {a for a, keyframes in known.items() if earlier.known.get(a) == keyframes and a not in left}
         unexamined = {area: p for area, p in search.unexamined.items() if area not in examined}
         candidates = tuple(candidate for candidate in earlier.search.candidates if candidate.area in examined)
         search = replace(search, unexamined=unexamined, candidates=candidates)
-        return _WindowSearch(search, known, max(0, len(unexamined) - _REGIONS))
+        return _WindowSearch(search, known, excluded, max(0, len(unexamined) - _REGIONS))
+
+    @property
+    def searched(self) -> int:
+        """Number of areas in which windows were searched, those of all windows together."""
+        searches = [own.search for own in self._searches.values() if own.search is not None]
+        return sum(search.areas - len(search.unexamined) for search in searches)
 
     def step(self) -> bool:
         """Take the next step, of the work of an event; whether there was one."""
@@ -131,11 +147,11 @@ class PlacementSearch:
         :param left_out: number of the newest windows that do not count.
         """
         pair, windows = self.pair, self.windows[: len(self._in_order) - left_out]
-        known = len(pair.known)
         candidates = [self._candidates(number, each) for number, each in enumerate(self._in_order[: len(windows)])]
+        prior = PlacementPrior.of_pair(len(pair.known), len(windows), pair.log_repetition)
         geometry = PlacementGeometry(pair.hybrid_map, windows)
         comparison = PlaceComparison(pair, windows, geometry, self._configuration, self._map_search.grid_cache)
-        return placement_distribution(geometry, candidates, pair.joint, known, comparison.log_ratio)
+        return placement_distribution(geometry, candidates, pair.joint, prior, comparison.log_ratio)
 
     def _candidates(self, number: int, window: Window | RendezvousWindow) -> list[WindowCandidate]:
         if isinstance(window, RendezvousWindow):
@@ -144,7 +160,17 @@ class PlacementSearch:
         if search is None:
             return []
         found = self._map_search.localize(pair.hybrid_map, search, pair.clutter)
-        return window_candidates(number, found, len(pair.known))
+        return window_candidates(number, found, max(1, search.areas))
+
+
+def _exclude_nothing(_: Window) -> frozenset[int]:
+    return frozenset()
+
+
+def _without_areas(search: GlobalSearch, excluded: frozenset[int]) -> GlobalSearch:
+    """A search before its first region, without some areas."""
+    unexamined = {area: p for area, p in search.unexamined.items() if area not in excluded}
+    return replace(search, areas=len(unexamined), unexamined=unexamined)
 
 
 def _first_keyframe(window: Window | RendezvousWindow) -> int:

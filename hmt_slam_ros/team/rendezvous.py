@@ -19,14 +19,14 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.team import TeamRendezvous
 from hmt_slam_ros.team.components import ComponentPair
-from hmt_slam_ros.team.placement import WindowCandidate
+from hmt_slam_ros.team.placement import UNSEEN_AREAS, WindowCandidate
 from hmt_slam_ros.team.windows import Window
 
 _RELIABILITY = 0.95
 """Probability that the robot that is observed is the one that is named."""
 
 _AREA_SIZE = 50.0
-"""Floor of an area, m2: a robot that is not the one that is named is anywhere in the map, in any direction."""
+"""Floor of an area, m2: a robot that is not the one that is named is anywhere in the building, in any direction."""
 
 _SINCE_KEYFRAME, _BETWEEN_KEYFRAMES = (
     np.diag([0.3, 0.3, math.radians(12.0)]) ** 2,
@@ -124,7 +124,7 @@ def rendezvous_window(pair: ComponentPair, rendezvous: Rendezvous) -> Rendezvous
         return None
     belief = first.belief.compose(rendezvous.pose).compose(PoseGaussian(np.zeros(3), second.belief.covariance))
     peak = 1.0 / math.sqrt((2.0 * math.pi) ** 3 * float(np.linalg.det(belief.covariance)))
-    odds = 1.0 - _RELIABILITY + _RELIABILITY * peak * 2.0 * math.pi * _AREA_SIZE * len(pair.known)
+    odds = 1.0 - _RELIABILITY + _RELIABILITY * peak * 2.0 * math.pi * _AREA_SIZE * (len(pair.known) + UNSEEN_AREAS)
     window = Window(second.area, second.belief.mean, {second.keyframe: second.pose_of_keyframe})
     return RendezvousWindow(window, first.area, belief, math.log(odds))
 

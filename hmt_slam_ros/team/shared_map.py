@@ -256,6 +256,7 @@ class ForeignMapState:
     :ivar version: up to which it is known, 0 for nothing.
     :ivar scans: of its keyframes, and those of areas that are still to come; ``areas`` likewise.
     :ivar clutter: usual rate of contradictions of the map.
+    :ivar log_repetition: log Bayes factor of a building that repeats itself, from this map in itself, nats.
     """
 
     session: str
@@ -263,6 +264,7 @@ class ForeignMapState:
     scans: tuple[SharedScan, ...] = ()
     areas: tuple[SharedArea, ...] = ()
     clutter: Clutter = NO_CLUTTER
+    log_repetition: float = 0.0
 
 
 class ForeignMap:
@@ -270,11 +272,13 @@ class ForeignMap:
 
     :ivar session: of the map.
     :ivar version: up to which it is known, 0 for nothing.
+    :ivar log_repetition: log Bayes factor of a building that repeats itself, from this map in itself, nats.
     """
 
     def __init__(self, state: ForeignMapState) -> None:
         """:param state: to go on from."""
         self.session, self.version, self._clutter = state.session, state.version, state.clutter
+        self.log_repetition = state.log_repetition
         self._areas = {area.area: area for area in state.areas}
         self._scans = {scan.keyframe: scan for scan in state.scans}
 
@@ -282,7 +286,7 @@ class ForeignMap:
     def state(self) -> ForeignMapState:
         """The map as a value."""
         scans, areas = tuple(self._scans.values()), tuple(self._areas.values())
-        return ForeignMapState(self.session, self.version, scans, areas, self._clutter)
+        return ForeignMapState(self.session, self.version, scans, areas, self._clutter, self.log_repetition)
 
     @property
     def scan_count(self) -> int:
@@ -338,4 +342,4 @@ class ForeignMap:
         if areas:
             hybrid_map = hybrid_map.subgraph(connected_areas(hybrid_map, areas[0]))
         scans = {keyframe: item.scan for keyframe, item in self._scans.items()}
-        return Component.of_map(hybrid_map, scans, self._clutter)
+        return Component.of_map(hybrid_map, scans, self._clutter, self.log_repetition)

@@ -26,6 +26,7 @@ from hmt_slam_ros.team.join import Meeting, judge, was_sure
 from hmt_slam_ros.team.join_state import JoinState, next_join
 from hmt_slam_ros.team.placement_search import PlacementSearch
 from hmt_slam_ros.team.rendezvous import KnownRendezvous
+from hmt_slam_ros.team.repetition import RepetitionTest
 from hmt_slam_ros.team.shared_map import ForeignMap, ForeignMapState, SharedMap, SharedMapState
 from hmt_slam_ros.team.team_frame import team_poses
 
@@ -118,6 +119,7 @@ class Team:
         self._shared = SharedMap(state.robot, state.session, state.shared)
         # The own map as the others see it.
         self._own = ForeignMap(ForeignMapState(state.session))
+        self._repetition, self._tested_keyframes, self._tested_version = RepetitionTest(configuration), 0, 0
         self._others = {name: _Other(own) for name, own in state.others.items()}
         self._pairs = {name: _PairState(configuration, state.joins.get(name, JoinState())) for name in state.others}
         self._placements = {(each.robot, each.first, each.second): each for each in state.placements}
@@ -142,7 +144,8 @@ class Team:
     @property
     def status(self) -> TeamStatus:
         """What the others have to know of the map that is shared."""
-        return TeamStatus(self._robot, self._shared.session, self._shared.version, self._shared.digest)
+        shared = self._shared
+        return TeamStatus(self._robot, shared.session, shared.version, shared.digest, self._own.log_repetition)
 
     @property
     def session(self) -> str:
@@ -223,6 +226,8 @@ class Team:
             known = self._others[name] = _Other(ForeignMapState(status.session))
             self._pairs[name] = _PairState(self._configuration, JoinState())
             self._forget_placements(name)
+        if known.map.log_repetition != status.log_repetition:
+            known.map.log_repetition, self._pairs[name].is_outdated = status.log_repetition, True
         is_stuck = (known.newest, known.arrived) == (status.map_version, known.map.version)
         known.newest, known.arrived = max(known.newest, status.map_version), known.map.version
         if known.requested == known.map.version and not is_stuck:
@@ -283,20 +288,48 @@ class Team:
 
         :param may_wait: whether a search may wait until the maps have grown some more.
         """
-        answers: list[Message] = []
+        growth = _MIN_GROWTH if may_wait else 0
+        answers, steps = self._test_repetition(steps, growth)
         for name, pair in sorted(self._pairs.items()):
             # A search ends with the maps with which it began: maps that grow would put its end off again and again.
             if pair.is_outdated and pair.is_judged:
-                self._update(name, pair, _MIN_GROWTH if may_wait else 0)
+                self._update(name, pair, growth)
             while steps > 0 and not pair.is_judged:
                 steps -= 1
                 if not pair.search.step():
                     answers += self._judge(name, pair)
         return answers
 
+    def _test_repetition(self, steps: int, growth: int) -> tuple[list[Message], int]:
+        """Go on with the search of the own map in itself, if there is another robot, and it has grown enough.
+
+        :returns: the status where the evidence is new, and how many of the steps are left.
+        """
+        own, test = self._own, self._repetition
+        grown = own.scan_count - self._tested_keyframes
+        if test.is_done and self._is_untested and not 0 <= grown < growth:
+            self._tested_version, self._tested_keyframes = own.version, own.scan_count
+            if own.scan_count:
+                test.update(own.component(), _SHIFT)
+        while steps > 0 and not test.is_done:
+            steps -= 1
+            test.step()
+        if not test.is_done or test.log_ratio == own.log_repetition:
+            return [], steps
+        own.log_repetition = test.log_ratio
+        for pair in self._pairs.values():
+            pair.is_outdated = True
+        return [self.status], steps
+
+    @property
+    def _is_untested(self) -> bool:
+        return bool(self._others) and self._tested_version != self._own.version
+
     @property
     def is_searching(self) -> bool:
         """Whether there is something left to search."""
+        if self._is_untested or not self._repetition.is_done:
+            return True
         return any(pair.is_outdated or not pair.is_judged for pair in self._pairs.values())
 
     def _update(self, name: str, pair: _PairState, growth: int) -> None:

@@ -1,0 +1,96 @@
+"""Repetition: whether a building repeats itself, from a map that is searched in itself.
+
+Where one robot's ground looks like another's all along, it is the same ground, or its twin in a building that repeats
+itself: halls of a hospital, the sides of a ring, floors. No scan tells these apart before there is common ground. But
+a building that repeats itself mostly does so within one map, too, where each placement but the identity is known to be
+false. With R the repetition,
+
+    log P(map | R) / P(map | not R) = log(q + (1 - q) mean over placements of P(windows | twin) / P(windows | chance))
+
+and q the probability that the twin lies beyond the map. Parts that were not searched tell nothing: they count 1
+(docs/decisions/0085-repetition.md).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
+from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions, stack_poses
+from hmt_slam_ros.messages.team import MAX_LOG_REPETITION
+from hmt_slam_ros.team.components import Component, ComponentPair, Shift, combine
+from hmt_slam_ros.team.placement_search import PlacementSearch
+from hmt_slam_ros.team.windows import MAX_LENGTH, Window
+
+_BEYOND = 0.5
+"""Probability that the twin of mapped ground, if there is one, is not mapped itself."""
+
+
+_DIGITS = 2
+"""Decimal digits of a log Bayes factor: others are nothing new."""
+
+
+class RepetitionTest:
+    """Searches a map in itself, while it grows: a bounded step at a time.
+
+    :ivar log_ratio: log Bayes factor of a building that repeats itself, as of the end of the last search, nats.
+    :ivar is_done: whether the search is at its end.
+    """
+
+    def __init__(self, configuration: Configuration) -> None:
+        self._search = PlacementSearch(configuration, _Surroundings)
+        self.log_ratio, self.is_done = 0.0, True
+
+    def update(self, component: Component, shift: Shift | None = None) -> None:
+        """Go on with a map that grew or changed.
+
+        :param component: with an area or more.
+        :param shift: added to the numbers of its copy; as little as possible if None.
+        """
+        self._search.update(combine(component, component, shift))
+        self.is_done = False
+
+    def step(self) -> None:
+        """Take the next step, of the work of an event; at the end ``log_ratio`` is new."""
+        if not self._search.step():
+            self.log_ratio, self.is_done = _log_ratio(self._search), True
+
+
+def add_repetition(component: Component, configuration: Configuration) -> Component:
+    """A component with what the search of its whole map in itself tells."""
+    test = RepetitionTest(configuration)
+    test.update(component)
+    while not test.is_done:
+        test.step()
+    return replace(component, log_repetition=test.log_ratio)
+
+
+class _Surroundings:
+    """The areas around a window of a map and its copy, where it fits since it lies there."""
+
+    def __init__(self, pair: ComponentPair) -> None:
+        """:param pair: of a map and itself."""
+        self._shift, self._poses = pair.area_shift, connected_areas(pair.hybrid_map, pair.joint[0])
+        positions = {area: keyframe_positions(pair.hybrid_map, area, own.mean) for area, own in self._poses.items()}
+        self._positions = np.concatenate(list(positions.values()))
+        self._areas = np.repeat(list(positions), [len(own) for own in positions.values()])
+
+    def __call__(self, window: Window) -> frozenset[int]:
+        """Those with a keyframe so near that the window would overlap its own copy."""
+        pose = self._poses[window.area - self._shift].mean
+        positions = se2.compose(se2.compose(pose, window.reference), stack_poses(window.poses))[:, :2]
+        distances = np.hypot(*(self._positions[:, None] - positions).transpose(2, 0, 1)).min(axis=1)
+        return frozenset(np.unique(self._areas[distances <= MAX_LENGTH]).tolist())
+
+
+def _log_ratio(search: PlacementSearch) -> float:
+    possible = len(search.pair.known) * max(1, len(search.windows))
+    ratios = [min(sum(each.evidence), MAX_LOG_REPETITION) for each in search.distribution().placements]
+    mean = (float(np.exp(ratios).sum()) + possible - search.searched) / possible
+    log_ratio = math.log(_BEYOND + (1.0 - _BEYOND) * mean)
+    return round(min(log_ratio, MAX_LOG_REPETITION), _DIGITS)

@@ -1,0 +1,53 @@
+"""Maps that are searched in themselves."""
+
+import math
+from dataclasses import replace
+
+import pytest
+from laps import CONFIGURATION, map_lap
+from test_team_join import rooms
+
+from hmt_slam_ros.team.components import Shift, combine
+from hmt_slam_ros.team.repetition import RepetitionTest, add_repetition
+
+OFFICE, RING = "sim:office,size=0.7,seed=51", "sim:ring,seed=50"
+
+
+def log_repetition(component):
+    return add_repetition(component, CONFIGURATION).log_repetition
+
+
+def test_an_office_does_not_repeat_itself():
+    # Most of its windows are searched in few areas: the others are too near. A twin may lie beyond the map.
+    assert math.log(0.5) < log_repetition(map_lap(OFFICE, 0)) < -0.1
+
+
+def test_a_ring_with_equal_sides_repeats_itself():
+    assert log_repetition(map_lap(RING, 0)) > 5.0
+
+
+def test_of_two_equal_rooms_one_is_the_twin_of_the_other():
+    assert log_repetition(rooms((0.0, 30.0), 0)) > 0.3
+
+
+def test_a_map_of_one_place_tells_nothing():
+    assert log_repetition(rooms((0.0,), 0)) == 0.0
+
+
+def test_a_place_beside_itself_is_no_twin():
+    """Areas so near that a window overlaps its copy are not searched."""
+    assert log_repetition(rooms((0.0, 1.0), 0)) == 0.0
+
+
+def test_a_map_that_grows_ends_as_if_it_had_been_tested_whole():
+    test, component = RepetitionTest(CONFIGURATION), rooms((0.0, 30.0, 60.0), 0)
+    for part in (rooms((0.0,), 0), rooms((0.0, 30.0), 0), component):
+        test.update(part, Shift(1000, 10_000))
+        while not test.is_done:
+            test.step()
+    assert test.log_ratio == pytest.approx(log_repetition(component), abs=0.011)
+
+
+def test_the_evidence_of_two_maps_of_a_building_adds_up():
+    one, other = (replace(rooms((0.0,), seed), log_repetition=own) for seed, own in ((0, 1.5), (5, -0.5)))
+    assert combine(one, other).log_repetition == combine(other, one).log_repetition == 1.0
