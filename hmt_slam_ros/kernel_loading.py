@@ -23,8 +23,8 @@ COMPILING = "compiling kernels"
 """Beginning of the progress, in diagnostics and on a terminal."""
 _PRIOR = 1.0
 """Time of compilation, s, as which it counts that this machine is as fast as that of the table."""
-_PLUG_INS = ("hmt_slam_ros.landmarks.", "hmt_slam_ros.places.")
-"""Modules that processes import only where the configuration asks for them."""
+_PLUG_INS = ("hmt_slam_ros.landmarks.", "hmt_slam_ros.places.", "hmt_slam_ros.grids.virtual_scan")
+"""Modules that processes import only where the configuration, or a subscriber, asks for them."""
 _LOCK = "compiling"
 """File in the folder of a module's kernels that is locked by the process that compiles one of them."""
 

@@ -43,7 +43,19 @@ COMMANDS: tuple[tuple[str, ...], ...] = (
 )
 """Commands; ``{out}`` is the folder of the last one that mapped without --from."""
 
-FOR_SUBSCRIBERS = {"hmt_slam_ros.grids.occupancy_map:_vote": "tlca"}
+FOR_SUBSCRIBERS = dict.fromkeys(
+    (
+        "hmt_slam_ros.grids.occupancy_map:_vote",
+        "hmt_slam_ros.grids.virtual_scan:_cast_beams",
+        "hmt_slam_ros.landmarks.landmarks:_find_corners",
+        "hmt_slam_ros.landmarks.line_extraction:_extract",
+        "hmt_slam_ros.landmarks.line_extraction:_gap_starts",
+        "hmt_slam_ros.landmarks.line_extraction:_visible_segments",
+        "hmt_slam_ros.landmarks.line_extraction:partition_beams",
+        "hmt_slam_ros.landmarks.openings:_select_openings",
+    ),
+    "tlca",
+)
 """{kernel: node} of what a node calls only for subscribers of a topic."""
 
 Calls = dict[tuple[str, str], set[str]]

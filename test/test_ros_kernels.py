@@ -13,6 +13,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import OccupancyGrid
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.messages.documents import RobotStatus, decode
@@ -20,7 +21,7 @@ from hmt_slam_ros.messages.messages import ClosureDecision
 from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.recorder_node import RecorderNode
-from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, IS_LOCALIZED, MAP
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, IS_LOCALIZED, LANDMARKS, MAP
 
 BUNDLED = Path(__file__).resolve().parent.parent / "data" / "malaga_one_loop"
 
@@ -40,7 +41,9 @@ class Drive:
         self.localized = listener.subscribe(Bool, IS_LOCALIZED, topics.LATCHED)
         self._decisions = listener.subscribe(String, DOCUMENTS[ClosureDecision], topics.CHAIN)
         self._robot_states = listener.subscribe(String, DOCUMENTS[RobotStatus], topics.LATCHED)
-        listener.subscribe(OccupancyGrid, MAP, topics.LATCHED)  # tlca draws it for subscribers alone
+        # tlca makes these for subscribers alone.
+        listener.subscribe(OccupancyGrid, MAP, topics.LATCHED)
+        self.landmarks = listener.subscribe(MarkerArray, LANDMARKS, topics.LATCHED)
         self._nodes = [start(name, preload=False, laser_pose="[0.0, 0.0, 0.0]") for name in process_names()]
 
     def run(self, duration):
@@ -68,6 +71,7 @@ def test_no_kernel_is_loaded_amid_a_drive_with_a_loop_closure_and_a_relocalizati
     listener.until(lambda: all(kernel_entries(drive.reported[count:], name) for name in process_names()))
     last = {name: kernel_entries(drive.reported, name)[-1] for name in process_names()}
     assert all(entry.endswith(" loaded") for entry in last.values()), last
+    assert {marker.ns for marker in drive.landmarks[-1].markers} >= {"corners", "openings"}
     assert [name for name, entry in last.items() if entry == "0 loaded"] == ["rtl"]
 
 

@@ -106,9 +106,9 @@ def test_what_is_large_is_published_less_often(listener):
         begin = time.thread_time()
         while time.thread_time() - begin < 0.04:
             pass
-        return String(data=str(renderer.events))
+        return String(data=str(renderer.version))
 
-    renderer = SimpleNamespace(events=1)
+    renderer = SimpleNamespace(version=1)
     publisher = MapPublisher(listener.node, String, "large", make, period=0.01)
     publisher.publish_if_due(renderer)
     assert made == []  # as there are no subscribers
@@ -116,11 +116,11 @@ def test_what_is_large_is_published_less_often(listener):
 
     def is_made_twice():
         publisher.publish_if_due(renderer)
-        renderer.events = 1 + len(made)
+        renderer.version = 1 + len(made)
         return len(made) == 2
 
     listener.until(is_made_twice)
     assert made[1] - made[0] > 0.04 / 0.05
     listener.until(lambda: [message.data for message in received] == ["1", "2"])
-    publisher.publish_if_due(SimpleNamespace(events=2))
+    publisher.publish_if_due(SimpleNamespace(version=2))
     assert len(made) == 2

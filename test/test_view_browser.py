@@ -272,7 +272,11 @@ def test_layers_are_hidden_and_shown(map_page):
     page.board.put("goal", [3.0, 4.0, 0.0])
     page.board.put("look", [10.1, 0.0, 0.0])  # the robot is there
     page.board.put("marks", {"lift 2": {"area": 1, "at": [0.5, 0.0]}, "door": {"area": 99, "at": [0.0, 0.0]}})
+    page.board.put("rooms", [["room 1", 4.0, 3.0], ["room 2 by door 12", -4.0, -3.0]])
+    corner, opening = [500, 500, 540, 500, 500, 500, 500, 540], [-500, 0, -500, 90]
+    page.board.put("landmarks", {"corners": corner, "convex_corners": corner, "openings": opening})
     counts = {"scan": 2, "particles": 1, "goals": 1, "marks": 1, "areas": 6, "path": 24, "arcs": 6, "covariances": 6}
+    counts |= {"rooms": 2, "landmarks": 3}
     page.until(lambda: {name: page.drawing[name] for name in counts} == counts)
     for name, count in counts.items():
         box = f"document.querySelector('[data-layer={name}]')"
@@ -285,7 +289,7 @@ def test_layers_are_hidden_and_shown(map_page):
     page.board.append_event({**history(25)[-1], "live": 1})
     page.until(lambda: page.drawing["goals"] == 1)
     legend = page.browser.evaluate("document.getElementById('legend').textContent")
-    for title in ("Scan", "Particles", "Goals", "Marks", "Path, corrected"):
+    for title in ("Scan", "Particles", "Goals", "Marks", "Path, corrected", "Landmarks", "Room names"):
         assert title in legend
 
 
@@ -304,7 +308,7 @@ def test_the_chart_has_axes_and_says_what_is_under_the_pointer(map_page):
 
 
 TEXTS = ("ink", "soft", "good", "waiting", "attention", "fault", "area")
-SIGNS = ("wall", "path", "area", "here", "arc", "closure", "robot", "scan", "particle", "goal", "mark")
+SIGNS = ("wall", "path", "area", "here", "arc", "closure", "robot", "scan", "particle", "goal", "mark", "landmark")
 
 
 def luminance(color):

@@ -36,6 +36,7 @@ class ExplorationMap:
     :ivar roadmap: of the building.
     :ivar replica: maps and scans.
     :ivar event: the last keyframe event, -1 before the first.
+    :ivar version: grows with every change of the map and its rooms, from 0 of an empty one on.
     :ivar teammates: robots whose ground is part of the map.
     """
 
@@ -44,6 +45,7 @@ class ExplorationMap:
         self.roadmap = Roadmap.of_explorer(configuration)
         self.replica = replica or Replica()
         self.event = -1
+        self.version = 0 if replica is None else 1
         self.teammates = Teammates()
         self._updated_at = NO_KEYFRAME
         self._pose: RealTimePose | None = None
@@ -61,6 +63,7 @@ class ExplorationMap:
             self._keyframe_locator = None
             if isinstance(message, ClosureDecision):
                 self.event = message.sequence
+                self.version += 1
                 if message.foreign_ground is not None:
                     self.teammates.add(message.foreign_ground)
         elif isinstance(message, RealTimePose):
@@ -94,6 +97,24 @@ class ExplorationMap:
         """The area of a keyframe, None where it is not in the map."""
         hybrid_map = self.hybrid_map
         return next((area for area in hybrid_map.area_ids() if keyframe in hybrid_map.keyframes(area)), None)
+
+    def positions_in_map(
+        self, area_poses: Mapping[int, PoseGaussian], keyframes: Mapping[str, int]
+    ) -> dict[str, Float64]:
+        """{name: position in the map (2,), m} of named keyframes, without those whose area has no pose.
+
+        :param area_poses: {area: ``map_T_area``}.
+        :param keyframes: {name: keyframe}.
+        """
+        hybrid_map, wanted = self.hybrid_map, set(keyframes.values())
+        known = {
+            keyframe: se2.transform(area_poses[area].mean, pose[:2])
+            for area in hybrid_map.area_ids()
+            if area in area_poses
+            for keyframe, pose in hybrid_map.keyframes(area).items()
+            if keyframe in wanted
+        }
+        return {name: known[keyframe] for name, keyframe in keyframes.items() if keyframe in known}
 
     @property
     def has_changed(self) -> bool:
@@ -163,6 +184,11 @@ class ExplorationMap:
     def _add_room(self, room: tuple[int, ...]) -> None:
         if room and len(self._named_rooms([*self._rooms, room])) > len(self._named_rooms(self._rooms)):
             self._rooms.append(room)
+            self.version += 1
+
+    def named_rooms(self) -> dict[str, int]:
+        """{name: keyframe in its middle} of entered rooms."""
+        return self._named_rooms(self._rooms)
 
     def _named_rooms(self, rooms: list[tuple[int, ...]]) -> dict[str, int]:
         """{name: keyframe} of rooms, with the nearest keyframe that is not pruned.
@@ -181,7 +207,7 @@ class ExplorationMap:
 
     def named_places(self) -> dict[str, int]:
         """{name: keyframe in its middle} of entered rooms and of areas."""
-        named = self._named_rooms(self._rooms)
+        named = self.named_rooms()
         hybrid_map = self.hybrid_map
         for area in hybrid_map.area_ids():
             keyframes = {k: pose for k, pose in hybrid_map.keyframes(area).items() if k in self.roadmap.graph}

@@ -106,6 +106,10 @@ class Explorer:
             self.exploration_map.on_message(message)
         return []
 
+    def named_rooms(self) -> dict[str, int]:
+        """{name: keyframe in its middle} of entered rooms."""
+        return self.exploration_map.named_rooms()
+
     @property
     def progress(self) -> TaskProgress:
         """How far the task is."""

@@ -267,6 +267,10 @@ class PilotProcess:
             self.task = None
         return outputs
 
+    def named_rooms(self) -> dict[str, int]:
+        """{name: keyframe at its destination} of the rooms of tasks."""
+        return {name: destination.keyframe for name, destination in self.rooms.items()}
+
     @property
     def progress(self) -> TaskProgress:
         """How far the task is; the path to a room is not known beforehand."""

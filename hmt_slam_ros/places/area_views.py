@@ -120,6 +120,14 @@ class AreaViewCache:
             view = self._views[area][_cache_key(keyframes)]
         return view
 
+    def cached_views(self, areas: Mapping[int, Mapping[int, Float64]]) -> dict[int, AreaView]:
+        """{area: view} of those areas whose view is cached.
+
+        :param areas: {area: keyframes as in `area_view`}.
+        """
+        views = ((area, self._cached_view(area, keyframes)) for area, keyframes in areas.items())
+        return {area: view for area, view in views if view is not None}
+
     def prefetch(self, areas: Iterable[tuple[int, Mapping[int, Float64]]], max_keyframes: int) -> None:
         """Process up to ``max_keyframes`` keyframes of areas without a cached view.
 

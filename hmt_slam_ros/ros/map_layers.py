@@ -1,15 +1,17 @@
-"""Subscriptions of the live page to the map as data, keyframes, scan, particles and goals."""
+"""Subscriptions of the live page to the map as data, keyframes, scan, particles, goals, rooms and landmarks."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import PoseArray, PoseStamped
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
+from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.alternatives import Alternatives
@@ -22,8 +24,17 @@ from hmt_slam_ros.ros.conversions import keyframe_from_frame, ranges_from_messag
 from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
 from hmt_slam_ros.ros.message_io import document_callback
 from hmt_slam_ros.ros.team_view import Subscribe
-from hmt_slam_ros.ros.topics import AMBIGUITY_GOAL, DOCUMENTS, GOAL_POSE, KEYFRAME_SCANS, PARTICLES, SCAN
-from hmt_slam_ros.ros.view_conversions import finite, planar_pose
+from hmt_slam_ros.ros.topics import (
+    AMBIGUITY_GOAL,
+    DOCUMENTS,
+    GOAL_POSE,
+    KEYFRAME_SCANS,
+    LANDMARKS,
+    PARTICLES,
+    ROOMS,
+    SCAN,
+)
+from hmt_slam_ros.ros.view_conversions import finite, landmarks_section, planar_pose, rooms_section
 from hmt_slam_ros.untrusted_input import shorten
 from hmt_slam_ros.view.board import Board
 from hmt_slam_ros.view.map_sections import LaserBeams, MapSections
@@ -106,6 +117,7 @@ class MapLayers:
         self._topologies = MapDocuments(Topology, self.sections.add_topology, diagnostics)
         self._alternatives = MapDocuments(Alternatives, self.sections.add_alternatives, diagnostics)
         self._watched: list[Any] = []
+        self._rooms: dict[str, list[list[Any]]] = dict.fromkeys(ROOMS, [])
         subscribe(String, DOCUMENTS[Topology], self._topologies.keep, topics.LATCHED)
         on_evidence = document_callback(diagnostics, Evidence, self.sections.add_evidence)
         subscribe(String, DOCUMENTS[Evidence], on_evidence, topics.LATCHED)
@@ -118,6 +130,8 @@ class MapLayers:
             _Layer(PoseStamped, GOAL_POSE, lambda m: board.put("goal", planar_pose(m.pose)), topics.NEWEST),
             _Layer(PoseStamped, AMBIGUITY_GOAL, lambda m: board.put("look", planar_pose(m.pose)), topics.NEWEST),
             _Layer(String, DOCUMENTS[PlaceEstimate], on_place, topics.LATCHED),
+            _Layer(MarkerArray, LANDMARKS, lambda m: board.put("landmarks", landmarks_section(m)), topics.LATCHED),
+            *(_Layer(MarkerArray, ROOMS[name], partial(self._on_rooms, name), topics.LATCHED) for name in ROOMS),
         )
 
     def update(self, now: float) -> None:
@@ -148,6 +162,12 @@ class MapLayers:
         if len(message.poses) > _MAX_PARTICLES:
             raise HmtSlamError(f"{len(message.poses)} particles are too many to be shown: look who publishes it")
         self._board.put("particles", [planar_pose(pose) for pose in message.poses])
+
+    def _on_rooms(self, node: str, message: MarkerArray) -> None:
+        """Show the rooms of all nodes; those of one name, which are one room, where the first node has it."""
+        self._rooms[node] = rooms_section(message)
+        named = {name: place for each in reversed(ROOMS) for name, *place in self._rooms[each]}
+        self._board.put("rooms", [[name, *place] for name, place in named.items()])
 
     def _on_place(self, place: PlaceEstimate) -> None:
         name = place.room or place.place

@@ -19,7 +19,7 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import ELLIPSE_95, PoseGaussian
-from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME
+from hmt_slam_ros.hybrid_map.hybrid_map import NO_KEYFRAME, KeyframePoses
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.hybrid_map.surroundings import stack_poses
 from hmt_slam_ros.messages.alternatives import Alternatives, alternative_hypotheses
@@ -32,6 +32,7 @@ from hmt_slam_ros.ros.keyframe_path import serialized_path
 
 if TYPE_CHECKING:
     from hmt_slam_ros.results.hmt_map import MapDocument
+    from hmt_slam_ros.sensors import Scan
 
 _AREA = ColorRGBA(r=0.12, g=0.47, b=0.71, a=0.9)
 _ROBOT_AREA = ColorRGBA(r=0.84, g=0.15, b=0.16, a=0.9)
@@ -67,6 +68,7 @@ class MapRenderer:
 
     :ivar stamp: of the newest keyframe, ns.
     :ivar events: number of keyframe events that the map has.
+    :ivar frame: name of the map's frame.
     """
 
     def __init__(self, configuration: Configuration, frame: str, state: MapRendererState, events: int = 0) -> None:
@@ -76,7 +78,7 @@ class MapRenderer:
         :param events: number of keyframe events before.
         """
         self.stamp, self.events = state.stamp, events
-        self._settings, self._frame = configuration.local_map, frame
+        self._settings, self.frame = configuration.local_map, frame
         self._replica = Replica.from_state(state.replica)
         self._area_poses = {entry.area: entry.pose for entry in state.area_poses}
 
@@ -85,6 +87,16 @@ class MapRenderer:
         """The state of the renderer."""
         poses = tuple(AreaPose(area, pose) for area, pose in self._area_poses.items())
         return MapRendererState(self.stamp, self._replica.state, poses)
+
+    @property
+    def version(self) -> int:
+        """The number of keyframe events."""
+        return self.events
+
+    @property
+    def scans(self) -> Mapping[int, Scan]:
+        """{keyframe: scan}, of the same map the same object."""
+        return self._replica.scans
 
     def update(self, message: Message) -> None:
         """Take in a message of the chain."""
@@ -109,6 +121,17 @@ class MapRenderer:
         hybrid_map = self._replica.maps[self._replica.best_hypothesis]
         return [area for area in hybrid_map.area_ids() if area in self._area_poses]
 
+    def area_keyframes(self) -> dict[int, KeyframePoses]:
+        """{area: its keyframes with ``area_T_base``}, that of the robot, which grows, at the end."""
+        best = self._replica.best_hypothesis
+        hybrid_map, robot_area = self._replica.maps[best], self._replica.robot_areas[best]
+        return {area: hybrid_map.keyframes(area) for area in sorted(self._area_ids(), key=lambda a: a == robot_area)}
+
+    def known_area_poses(self) -> dict[int, Float64]:
+        """{area: ``map_T_area`` (3,)} of areas whose place in the map is known."""
+        poses = ((area, self._area_poses[area]) for area in self._area_ids())
+        return {area: belief.mean for area, belief in poses if not is_uninformative(belief)}
+
     def occupancy_grid(self) -> OccupancyGrid | None:
         """The occupancy grid, None before the first keyframe."""
         from hmt_slam_ros.grids.occupancy_map import occupancy_image  # noqa: PLC0415  only for subscribers
@@ -124,7 +147,7 @@ class MapRenderer:
         scans = [self._replica.scans[keyframe] for keyframe in keyframe_poses]
         poses = np.array(list(keyframe_poses.values()))
         image = occupancy_image(scans, poses, self._settings.cell, self._settings.max_range)
-        return grid_message(self.stamp, self._frame, image)
+        return grid_message(self.stamp, self.frame, image)
 
     def path(self) -> bytes:
         """The serialized nav_msgs/Path of the robot's own keyframes, in the order of their numbers.
@@ -132,13 +155,13 @@ class MapRenderer:
         Without keyframes in areas whose place in the map is unknown.
         """
         hybrid_map = self._replica.maps[self._replica.best_hypothesis]
-        known = [area for area in self._area_ids() if not is_uninformative(self._area_poses[area])]
+        known = self.known_area_poses()
         numbers = np.array([k for area in known for k in hybrid_map.keyframes(area)], dtype=np.int64)
-        blocks = [se2.compose(self._area_poses[a].mean, stack_poses(hybrid_map.keyframes(a))) for a in known]
+        blocks = [se2.compose(frame, stack_poses(hybrid_map.keyframes(area))) for area, frame in known.items()]
         own = [k for k in np.argsort(numbers).tolist() if numbers[k] > NO_KEYFRAME]
         stamps = np.array([self._replica.scans[k].stamp for k in numbers[own].tolist()], dtype=np.int64)
         poses = np.concatenate(blocks)[own] if blocks else np.zeros((0, 3))
-        return serialized_path(self.stamp, self._frame, stamps, poses)
+        return serialized_path(self.stamp, self.frame, stamps, poses)
 
     def topology(self, robot_poses: Mapping[int, Float64]) -> Topology:
         """The areas and arcs as data.
@@ -146,7 +169,7 @@ class MapRenderer:
         :param robot_poses: {hypothesis: ``area_T_base`` of the robot at the newest keyframe event, shape (3,)}.
         """
         pose = robot_poses[self._replica.best_hypothesis]
-        return Topology.from_replica(self._replica, self._area_poses, pose, self._frame, self.events, self.stamp)
+        return Topology.from_replica(self._replica, self._area_poses, pose, self.frame, self.events, self.stamp)
 
     def alternatives(self, robot_poses: Mapping[int, Float64]) -> Alternatives:
         """The maps of the other hypotheses as data.
@@ -204,7 +227,7 @@ class MapRenderer:
         return [marker]
 
     def _marker(self, group: str, number: int, kind: int, size: tuple[float, float, float], color: ColorRGBA) -> Marker:
-        marker = Marker(header=header_message(self.stamp, self._frame), ns=group, id=number, type=kind, color=color)
+        marker = Marker(header=header_message(self.stamp, self.frame), ns=group, id=number, type=kind, color=color)
         marker.scale = Vector3(x=size[0], y=size[1], z=size[2])
         marker.pose.orientation.w = 1.0
         return marker

@@ -33,6 +33,7 @@ from hmt_slam_ros.ros.conversions import (
     transform_message,
 )
 from hmt_slam_ros.ros.execution import set_realtime_priority
+from hmt_slam_ros.ros.landmark_publisher import LandmarkPublisher
 from hmt_slam_ros.ros.map_publisher import MapPublisher
 from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
 from hmt_slam_ros.ros.odometry_frames import ODOM_FRAME, OdometryFrames, declare_odometry_frame
@@ -139,12 +140,13 @@ class TlcaNode(ProcessNode):
         """As any process node; also publish the map."""
         super().configure_node()
         self._renderer = self._make_renderer(MapRendererState.from_document(self.initial_state.map))
-        self._map_publishers = (
+        self._map_publishers: tuple[MapPublisher[MapRenderer] | LandmarkPublisher, ...] = (
             MapPublisher(self, OccupancyGrid, MAP, MapRenderer.occupancy_grid, _DRAWING_PERIOD),
             MapPublisher(self, MarkerArray, GRAPH, MapRenderer.graph_markers, _DRAWING_PERIOD),
             MapPublisher(self, PathMessage, PATH, MapRenderer.path, _DATA_PERIOD),
             MapPublisher(self, String, DOCUMENTS[Topology], self._topology_document, _DATA_PERIOD),
             MapPublisher(self, String, DOCUMENTS[Alternatives], self._alternatives_document, _DATA_PERIOD),
+            LandmarkPublisher(self, self.configuration),
         )
         self._ambiguity_goals = self.create_publisher(PoseStamped, AMBIGUITY_GOAL, topics.STREAM)
         self.create_timer(_CHECK_PERIOD, self._publish_if_changed, clock=self.diagnostics.steady_clock)

@@ -49,6 +49,9 @@ class TaskProcess(Process, Protocol):
     def progress(self) -> TaskProgress:
         """How far the task is."""
 
+    def named_rooms(self) -> dict[str, int]:
+        """{name: keyframe in it} of the rooms to which tasks lead."""
+
 
 class TaskHost(ManagedNode):
     """A node to which tasks are given.

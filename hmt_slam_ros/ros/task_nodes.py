@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import Odometry as OdometryMessage
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
+from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
+from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.messages.documents import ResetRequest, encode
 from hmt_slam_ros.messages.gate import check_belief
 from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
@@ -34,9 +38,11 @@ from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.execution import spin_until
 from hmt_slam_ros.ros.initial_state import InitialState, declare_start_from
 from hmt_slam_ros.ros.laser_mountings import LaserMountings, check_scan_message
+from hmt_slam_ros.ros.map_publisher import MapPublisher
 from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
 from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, OdometryFrames, declare_odometry_frame
 from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_poses
+from hmt_slam_ros.ros.room_markers import RoomMarkers
 from hmt_slam_ros.ros.task_interface import TaskHost, TaskInterface, TaskProcess
 from hmt_slam_ros.ros.topics import (
     CMD_VEL,
@@ -45,10 +51,14 @@ from hmt_slam_ros.ros.topics import (
     INITIAL_POSE,
     ODOM,
     PLACE,
+    ROOMS,
     SCAN,
 )
 from hmt_slam_ros.sensors import Odometry
 from hmt_slam_ros.untrusted_input import shorten
+
+if TYPE_CHECKING:
+    from hmt_slam_ros.exploration.exploration_map import ExplorationMap
 
 _UNKNOWN_POSE = PoseGaussian.from_pose(np.zeros(3))
 _FIRST_AREA_POSE = AreaPose(FIRST_AREA, PoseGaussian.from_pose(np.zeros(3)))
@@ -57,6 +67,8 @@ _MAX_GAP_CHECKS = 2
 """Further checks, once a second, that find the same gap in the chain before the node ends."""
 _MISSING_TRANSFORMS = 20
 """Scans without a transform after which that is reported."""
+_ROOMS_PERIOD = 0.9
+"""Least time between two messages of rooms, s; just below whole checks."""
 
 
 class TaskNode(TaskHost):
@@ -125,6 +137,9 @@ class TaskNode(TaskHost):
         )
         subscribe_document(self, ResetRequest, self._on_reset_request, topics.CHAIN)
         self.create_timer(PERIOD, self._check_chain, clock=self.diagnostics.steady_clock)
+        self._room_markers = RoomMarkers(self.map_frame)
+        self._room_publisher = MapPublisher(self, MarkerArray, ROOMS[self._name], self._make_rooms, _ROOMS_PERIOD)
+        self.create_timer(PERIOD, self._publish_rooms, clock=self.diagnostics.steady_clock)
 
     def deactivate_node(self) -> None:
         """Stop the robot, and end the drive to a pose."""
@@ -230,6 +245,17 @@ class TaskNode(TaskHost):
         self._reset_number = request.number
         self._inbox.reset(initial_state.events, request.number)
         self._inbox.deliver_early()
+        self._room_markers.forget()
+        self._room_publisher.invalidate()
+
+    def _publish_rooms(self) -> None:
+        if self.is_active:
+            self._room_publisher.publish_if_due(self._process.exploration_map)
+
+    def _make_rooms(self, exploration_map: ExplorationMap) -> MarkerArray | None:
+        """The names of rooms where they are in the map; None where nothing changed."""
+        known = {area: pose for area, pose in self.area_poses.items() if not is_uninformative(pose)}
+        return self._room_markers.make(exploration_map.positions_in_map(known, self._process.named_rooms()))
 
     def _check_chain(self) -> None:
         """Stop the robot where messages of the chain were lost.

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
+from geometry_msgs.msg import Point, Pose, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
+from visualization_msgs.msg import Marker, MarkerArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import ELLIPSE_95
@@ -24,13 +25,19 @@ from hmt_slam_ros.ros.conversions import (
     time_message,
 )
 from hmt_slam_ros.ros.diagnostics import HARDWARE_ID
+from hmt_slam_ros.ros.landmark_markers import MAX_LANDMARKS, POINTS_PER_LANDMARK
 from hmt_slam_ros.sensors.plausibility import MAX_COORDINATE, check_quaternion
+from hmt_slam_ros.untrusted_input import shorten
 from hmt_slam_ros.view.incidents import Incident
 
 _MAX_CELLS = 64_000_000
 """Of a map: 400 m by 400 m in cells of 5 cm; its picture takes about a second."""
 _MAX_FRAME = 40
 """Characters of an area's frame."""
+_MAX_ROOMS = 500
+"""Rooms whose names are shown."""
+_MAX_MARKERS = 1000
+"""Of one message, in which a room has one, and all landmarks of a kind have one."""
 _MAX_VARIANCE = 1e14
 """m^2 or rad^2 of a pose; the robot may be anywhere with 1e8."""
 
@@ -83,6 +90,48 @@ def planar_pose(message: Pose) -> list[float]:
     _check_pose(message)
     x, y, theta = pose_from_message(message).tolist()
     return [round(x, 3), round(y, 3), round(theta, 4)]
+
+
+def rooms_section(message: MarkerArray) -> list[list[Any]]:
+    """Name, x and y, m, of the rooms that texts name.
+
+    :raises HmtSlamError: where there are too many, or a number is not finite.
+    """
+    _check_count(message)
+    texts = [marker for marker in message.markers if marker.type == Marker.TEXT_VIEW_FACING and marker.text]
+    if len(texts) > _MAX_ROOMS:
+        raise HmtSlamError(f"{len(texts)} rooms are too many to be shown: look who publishes them")
+    return [[shorten(marker.text), *_rounded(marker.pose.position)] for marker in texts]
+
+
+def landmarks_section(message: MarkerArray) -> dict[str, list[int]]:
+    """{kind: coordinates of its landmarks, one landmark after the other, cm}.
+
+    A corner has 8 numbers, of two lines along its walls; an opening has 4, of its jambs.
+
+    :raises HmtSlamError: where there are too many, a number is not finite, or one is missing.
+    """
+    _check_count(message)
+    found: dict[str, list[int]] = {kind: [] for kind in POINTS_PER_LANDMARK}
+    for marker in message.markers:
+        if marker.ns in found and marker.type == Marker.LINE_LIST:
+            size, count = POINTS_PER_LANDMARK[marker.ns], len(marker.points)
+            if count % size or count > size * MAX_LANDMARKS:
+                raise HmtSlamError(
+                    f"{count} points of {marker.ns} are none of landmarks, or too many: look who publishes them"
+                )
+            found[marker.ns] = [round(100.0 * value) for point in marker.points for value in _rounded(point)]
+    return found
+
+
+def _check_count(message: MarkerArray) -> None:
+    if len(message.markers) > _MAX_MARKERS:
+        raise HmtSlamError(f"{len(message.markers)} markers are too many to be shown: look who publishes them")
+
+
+def _rounded(point: Point) -> list[float]:
+    """x and y of a point, m."""
+    return [round(finite(value, "position", MAX_COORDINATE), 3) for value in (point.x, point.y)]
 
 
 def map_cells(message: OccupancyGrid) -> NDArray[np.int8]:

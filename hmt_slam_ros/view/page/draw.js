@@ -69,7 +69,7 @@ function rgb(hex) {
  * Draw the plan: a scene, and the layers that are visible above it.
  * Returns what was drawn, and where: counts by layer, {robot, factor, middle, spots, team}.
  */
-export function drawPlan(canvas, camera, state, { scene, picture, walls, team, paint, others, robot, visible }) {
+export function drawPlan(canvas, camera, state, { scene, picture, walls, team, paint, others, robot, isLive, visible }) {
   const { context, width, height } = prepared(canvas);
   [camera.width, camera.height] = [width, height];
   context.fillStyle = themed("--unknown");
@@ -82,8 +82,9 @@ export function drawPlan(canvas, camera, state, { scene, picture, walls, team, p
   drawn.walls = visible.walls && walls ? walls.draw(context, camera, scene, themed("--wall")) : 0;
   drawn.team = team.map((other) => drawOther(context, camera, other));
   drawn.path = visible.path ? drawPath(context, camera, scene.path, paint) : 0;
+  drawn.landmarks = visible.landmarks && isLive ? drawLandmarks(context, camera, state.landmarks ?? {}) : 0;
   drawGraph(context, camera, scene, paint, visible, drawn);
-  drawLayers(context, camera, state, scene, robot, visible, drawn);
+  drawLayers(context, camera, state, scene, robot, isLive, visible, drawn);
   drawn.others = visible.others ? others.length : 0;
   if (visible.others) others.forEach(({ pose, paint: own, name }) => drawArrow(context, camera, pose, own, name));
   if (robot) {
@@ -116,8 +117,8 @@ function drawGraph(context, camera, scene, paint, visible, drawn) {
   drawn.spots = scene.areas.map(({ area, at }) => ({ area, at: camera.toScreen(at).map(Math.round) }));
 }
 
-/** Scan, particles, goals and marks; the first three are of now alone. */
-function drawLayers(context, camera, state, scene, robot, visible, drawn) {
+/** Rooms of the most probable map of now; scan, particles and goals, of a robot that is known; marks of any map. */
+function drawLayers(context, camera, state, scene, robot, isLive, visible, drawn) {
   const live = robot?.live ? robot.pose : null;
   const scan = visible.scan && live ? state.scan ?? [] : [];
   for (let k = 0; k < scan.length; k += 2) drawDot(context, camera, compose(live, [scan[k], scan[k + 1]]), themed("--scan"), 1.5);
@@ -130,7 +131,56 @@ function drawLayers(context, camera, state, scene, robot, visible, drawn) {
   const areas = new Map(scene.areas.map((area) => [area.area, area.pose]));
   const marks = Object.entries(visible.marks ? state.marks ?? {} : {}).filter(([, mark]) => areas.has(mark.area));
   marks.forEach(([name, mark]) => drawSign(context, camera, compose(areas.get(mark.area), mark.at), themed("--mark"), name, false));
-  Object.assign(drawn, { scan: scan.length / 2, particles: particles.length, goals: goals.length, marks: marks.length });
+  const rooms = visible.rooms && isLive ? state.rooms ?? [] : [];
+  rooms.forEach(([name, ...at]) => drawTag(context, camera, at, name));
+  Object.assign(drawn, { rooms: rooms.length, scan: scan.length / 2, particles: particles.length, goals: goals.length, marks: marks.length });
+}
+
+const LEAST = 5; // px, of a wall of a corner
+
+/** Corners as two lines along their walls, openings as a line between two dots; returns how many. */
+function drawLandmarks(context, camera, { corners = [], convex_corners: convex = [], openings = [] }) {
+  const at = (flat, k) => camera.toScreen([flat[k] / 100, flat[k + 1] / 100]);
+  context.strokeStyle = context.fillStyle = themed("--landmark");
+  context.lineWidth = 1.5;
+  context.lineCap = "round";
+  context.beginPath();
+  for (const flat of [corners, convex]) {
+    for (let k = 0; k < flat.length; k += 4) {
+      const [[u, v], [end, other]] = [at(flat, k), at(flat, k + 2)];
+      const factor = Math.max(1, LEAST / Math.max(0.1, Math.hypot(end - u, other - v)));
+      context.moveTo(u, v);
+      context.lineTo(u + factor * (end - u), v + factor * (other - v));
+    }
+  }
+  for (let k = 0; k < openings.length; k += 4) {
+    const jambs = [at(openings, k), at(openings, k + 2)];
+    context.moveTo(...jambs[0]);
+    context.lineTo(...jambs[1]);
+    jambs.forEach(([u, v]) => context.fillRect(u - 1.5, v - 1.5, 3, 3));
+  }
+  context.stroke();
+  context.lineCap = "butt";
+  return (corners.length + convex.length) / 8 + openings.length / 4;
+}
+
+/** A name on a card, in the middle of a room. */
+function drawTag(context, camera, at, name) {
+  const [u, v] = camera.toScreen(at);
+  context.font = "600 12px system-ui, sans-serif";
+  const half = context.measureText(name).width / 2 + 6;
+  context.beginPath();
+  context.roundRect(u - half, v - 10, 2 * half, 20, 5);
+  context.fillStyle = themed("--card");
+  context.globalAlpha = 0.85;
+  context.fill();
+  context.globalAlpha = 1;
+  context.strokeStyle = context.fillStyle = themed("--ink");
+  context.lineWidth = 1;
+  context.stroke();
+  context.textAlign = "center";
+  context.textBaseline = "middle";
+  context.fillText(name, u, v + 0.5);
 }
 
 function drawDot(context, camera, at, paint, radius) {

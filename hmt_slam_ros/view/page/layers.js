@@ -13,6 +13,8 @@ const LAYERS = [
   ["particles", "Particles", "--particle", "dots"],
   ["goals", "Goals", "--goal", "ring"],
   ["marks", "Marks", "--mark", "square"],
+  ["landmarks", "Landmarks: corners, openings", "--landmark", "corner"],
+  ["rooms", "Room names", "--ink", "tag"],
   ["others", "Robot under other hypotheses", "--soft", "arrow"],
 ];
 

@@ -60,7 +60,7 @@ function draw() {
   if (mode === "follow" && robot) [camera.x, camera.y] = robot.pose;
   if (!isLive) walls.update();
   const drawn = drawPlan(plan, camera, state, {
-    scene, visible, robot, team: isLive ? team : [], others: isLive ? otherPoses() : [],
+    scene, visible, robot, isLive, team: isLive ? team : [], others: isLive ? otherPoses() : [],
     picture: isLive ? picture : null, walls: isLive ? null : walls, paint: other ? colour(selected) : null,
   });
   drawn.events = events.length;
