@@ -209,13 +209,17 @@ def topics_of_the_nodes():
     pytest.importorskip("rclpy", reason="the nodes need rclpy, which is not installed here")
     topics = import_module("hmt_slam_ros.ros.topics")
     names = {value for name, value in vars(topics).items() if name.isupper() and isinstance(value, str)}
-    return {f"/{name.lstrip('/')}" for name in names | set(topics.DOCUMENTS.values())}
+    return {f"/{name.lstrip('/')}" for name in names | {*topics.DOCUMENTS.values(), *topics.ROOMS.values()}}
+
+
+SHOWN = {"/map", "/hmt/graph", "/hmt/landmarks", "/explorer/rooms", "/pilot/rooms"}
+SHOWN |= {"/hmt/path", "/hmt/particles", "/pose", "/scan"}
 
 
 def test_rviz_shows_the_topics_the_nodes_publish():
     manager = yaml.safe_load((ROOT / "config" / "hmt_slam.rviz").read_text())["Visualization Manager"]
     topics = {display["Topic"]["Value"] for display in manager["Displays"] if "Topic" in display}
-    assert topics == {"/map", "/hmt/graph", "/hmt/path", "/hmt/particles", "/pose", "/scan"}
+    assert topics == SHOWN
     tools = {tool["Topic"]["Value"] for tool in manager["Tools"] if "Topic" in tool}
     assert tools == {"/initialpose"}
     assert topics | tools <= topics_of_the_nodes()
@@ -232,7 +236,7 @@ def test_foxglove_shows_the_topics_the_nodes_publish():
     panels = layout["configById"]
     assert panels_of(layout["layout"]) == set(panels)
     plan = panels["3D!plan"]
-    assert set(plan["topics"]) == {"/map", "/hmt/graph", "/hmt/path", "/hmt/particles", "/pose", "/scan"}
+    assert set(plan["topics"]) == SHOWN
     paths = [line["value"] for panel in panels.values() for line in panel.get("paths", ())]
     plotted = {path.split(".")[0] for path in (*paths, panels["Indicator!localized"]["path"])}
     assert plotted == {"/hmt/pmf", "/hmt/entropy", "/hmt/is_localized"}

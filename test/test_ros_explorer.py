@@ -11,6 +11,7 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.documents import decode
@@ -18,7 +19,7 @@ from hmt_slam_ros.messages.tasks import TaskFeedback
 from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import keyframe_frame, pose_from_message, pose_message
-from hmt_slam_ros.ros.topics import KEYFRAME_SCANS, KEYFRAMES, TASK_FEEDBACK
+from hmt_slam_ros.ros.topics import KEYFRAME_SCANS, KEYFRAMES, ROOMS, TASK_FEEDBACK
 
 WORLD = """
 walls: [[0, -1, 5, -1], [5, -1, 5, 1], [5, 1, 3, 1], [3, 1, 3, 4],
@@ -57,6 +58,7 @@ def system(tmp_path, start, listener):
 def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listener, system, start):
     """It also restarts where it was not there when the map was exchanged. Without a task there is none to cancel."""
     outcomes = listener.subscribe(String, "explorer/task_result", topics.LATCHED)
+    rooms = listener.subscribe(MarkerArray, ROOMS["explorer"], topics.LATCHED)
     goals = listener.subscribe(PoseStamped, "goal_pose", topics.STREAM)
     truths = listener.subscribe(PoseStamped, "ground_truth", topics.STREAM)
     feedback = listener.subscribe(String, TASK_FEEDBACK, topics.STREAM)
@@ -79,6 +81,8 @@ def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listene
     goals_.publish(String(data="go cellar"))
     listener.until(lambda: len(outcomes) > 1, alive=nodes)
     assert outcomes[1].data.startswith("go cellar: there is no such place: choose from")
+    assert outcomes[1].data.endswith(" room 1, area 0")
+    assert_room_is_the_arm(rooms[-1])
     goals_.publish(String(data="go area 0"))
     listener.until(lambda: len(outcomes) > 2, alive=nodes)
     assert outcomes[2].data == "go area 0: the robot is there"
@@ -103,6 +107,13 @@ def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listene
     again = start("explorer", laser_pose="[0.0,0.0,0.0]")
     listener.until(lambda: len(outcomes) > received, alive=[*others, robot, again])
     assert {outcome.data for outcome in outcomes[5:]} == {explored}
+
+
+def assert_room_is_the_arm(message):
+    (marker,) = [marker for marker in message.markers if marker.text == "room 1"]
+    assert 0.0 < marker.pose.position.x < 2.0  # from where the robot began, at (1, 0)
+    assert 1.0 < marker.pose.position.y < 4.0
+    assert marker.header.frame_id == "map"
 
 
 @pytest.mark.long

@@ -19,6 +19,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.action import ActionClient
 from std_msgs.msg import Bool, Header, String
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.documents import decode
@@ -27,7 +28,7 @@ from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import pose_from_message, pose_message
 from hmt_slam_ros.ros.navigation_action import NavigateToPose
-from hmt_slam_ros.ros.topics import DIAGNOSTICS, GOAL_POSE, INITIAL_POSE, IS_LOCALIZED, PLACE, TASK_FEEDBACK
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, GOAL_POSE, INITIAL_POSE, IS_LOCALIZED, PLACE, ROOMS, TASK_FEEDBACK
 
 PROCESSES = process_names()
 
@@ -63,6 +64,7 @@ class PilotedRobot:
         self._places = listener.subscribe(String, PLACE, topics.LATCHED)
         self._truths = listener.subscribe(PoseStamped, "ground_truth", topics.STREAM)
         self._localized = listener.subscribe(Bool, IS_LOCALIZED, topics.LATCHED)
+        self.rooms = listener.subscribe(MarkerArray, ROOMS["pilot"], topics.LATCHED)
         self._reports = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
         self._documents = listener.subscribe(String, TASK_FEEDBACK, topics.STREAM)
         self.goal_poses = listener.node.create_publisher(PoseStamped, "pilot/goal", topics.STREAM)
@@ -173,6 +175,9 @@ def test_it_goes_to_a_room_and_has_slam_begin_at_the_door(mapped_world, listener
     there = se2.compose(origin, pose_from_message(goal.pose))
     # The last keyframe in the room is up to half a meter before the drive's end.
     np.testing.assert_allclose(there, (ROOM[0], ROOM[1] - 0.25, 0.5 * math.pi), atol=0.25)
+    (marker,) = [marker for marker in run.rooms[-1].markers if marker.text == room]
+    shown = se2.transform(origin, np.array([marker.pose.position.x, marker.pose.position.y]))
+    np.testing.assert_allclose(shown, there[:2], atol=0.1)
     assert math.dist(run.truth()[:2], there[:2]) < 0.2
     assert_start(run, origin)
     run.until(lambda: run.is_localized)

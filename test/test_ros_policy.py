@@ -1,8 +1,10 @@
 """The SROS2 policy has the form of sros2's schema, and an enclave for every node."""
 
 import re
+import socket
 from collections import defaultdict
 from pathlib import Path
+from urllib.request import urlopen
 from xml.etree import ElementTree
 
 import pytest
@@ -41,6 +43,9 @@ SOMETIMES = {
         (
             "/map",
             "/hmt/alternatives",
+            "/hmt/landmarks",
+            "/explorer/rooms",
+            "/pilot/rooms",
             "/hmt/particles",
             "/hmt/ambiguity_goal",
             "/pilot/place_estimate",
@@ -61,10 +66,11 @@ def full_name(name, node):
 
 
 def permissions():
-    """{node: {qualifier: full names}}."""
+    """{enclave: {qualifier: full names}}."""
     found = {}
-    for profile in POLICY.iter("profile"):
-        rules = found[profile.get("node")] = defaultdict(set)
+    for enclave in POLICY.iter("enclave"):
+        (profile,) = enclave.iter("profile")
+        rules = found[enclave.get("path").removeprefix("/hmt_slam/")] = defaultdict(set)
         for group in profile:
             for qualifier in group.attrib:
                 rules[qualifier] |= {full_name(rule.text, profile.get("node")) for rule in group}
@@ -81,7 +87,8 @@ def test_it_has_the_form_of_the_schema():
         (profiles,) = enclave
         (profile,) = profiles
         assert (profiles.tag, profile.tag, set(profile.attrib)) == ("profiles", "profile", {"ns", "node"})
-        assert enclave.get("path") == f"/hmt_slam/{profile.get('node')}"
+        name = enclave.get("path").removeprefix("/hmt_slam/")
+        assert profile.get("node") == ("view" if name == "view_commands" else name)
         for group in profile:
             assert set(group.attrib) <= QUALIFIERS[group.tag]
             assert set(group.attrib.values()) == {"ALLOW"}
@@ -90,10 +97,14 @@ def test_it_has_the_form_of_the_schema():
             assert all(re.fullmatch(r"(~?/)?[a-z][a-z_/]*", rule.text) for rule in group)
 
 
-def test_every_node_has_an_enclave_and_only_a_person_requests():
+def test_every_node_has_an_enclave_and_only_a_person_requests_also_through_the_page_with_buttons():
     rules = permissions()
-    assert list(rules) == [*node_names(), RECORDER.name, "operator"]
-    assert [name for name in rules if rules[name]["request"]] == ["operator"]
+    assert list(rules) == [*node_names(), RECORDER.name, "view_commands", "operator"]
+    assert [name for name in rules if rules[name]["request"]] == ["view_commands", "operator"]
+    view, commands = rules["view"], rules["view_commands"]
+    assert commands["request"] == {"/slam/save", "/slam/pause", "/robot/pause"}
+    assert commands["publish"] - view["publish"] == {"/initialpose", "/goal_pose", "/explorer/goal", "/statement"}
+    assert all(commands[qualifier] == view[qualifier] for qualifier in ("subscribe", "reply", "call", "execute"))
     replies = {name for node in (*node_names(), RECORDER.name) for name in rules[node]["reply"]}
     assert rules["operator"]["request"] == replies
     executed = {name for node in node_names() for name in rules[node]["execute"]}
@@ -124,11 +135,12 @@ def used_names(listener, node):
     return used
 
 
-def assert_permissions(listener, nodes):
+def assert_permissions(listener, nodes, enclaves):
+    """:param enclaves: {node: its enclave}, of those with another name."""
     rules = permissions()
     for node in nodes:
         for qualifier, used in used_names(listener, node).items():
-            allowed = rules[node][qualifier]
+            allowed = rules[enclaves.get(node, node)][qualifier]
             assert used <= allowed, (node, qualifier, used - allowed)
             assert allowed - used <= SOMETIMES.keys(), (node, qualifier, allowed - used)
 
@@ -140,20 +152,34 @@ def ready_nodes(reported):
     return {name for name, state in states.items() if state in (None, "active")}
 
 
-@pytest.mark.parametrize("nodes", [PROCESSES, COMPANIONS], ids=["processes", "companions"])
-def test_running_nodes_use_what_their_enclaves_allow(listener, start, nodes):
+def test_running_processes_and_a_page_with_buttons_use_what_their_enclaves_allow(listener, start):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    processes = start_all(listener, start, PROCESSES | {"view": {"port": port, "controls": True}})
+    with urlopen(f"http://127.0.0.1:{port}/news", timeout=20):  # a browser
+        listener.until(lambda: "/hmt/landmarks" in used_names(listener, "view")["subscribe"], alive=processes)
+        assert_permissions(listener, [*PROCESSES, "view"], {"view": "view_commands"})
+
+
+def test_running_companions_use_what_their_enclaves_allow(listener, start):
+    start_all(listener, start, COMPANIONS)
+    assert_permissions(listener, COMPANIONS, {})
+
+
+def start_all(listener, start, nodes):
+    """Start nodes, and wait until they are active."""
     processes = [start(name, **parameters) for name, parameters in nodes.items()]
     reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
     names = {f"/{name}" for name in nodes}
     listener.until(lambda: ready_nodes(reported) >= names, alive=processes)
     listener.until(lambda: set(listener.node.get_node_names()) >= set(nodes), alive=processes)
-    assert_permissions(listener, nodes)
+    return processes
 
 
 def test_the_recorder_uses_what_its_enclave_allows(listener):
     recorder = RecorderNode(Configuration(), listener.context, "a_system")
     try:
         listener.until(lambda: RECORDER.name in listener.node.get_node_names())
-        assert_permissions(listener, [RECORDER.name])
+        assert_permissions(listener, [RECORDER.name], {})
     finally:
         recorder.destroy_node()

@@ -2,6 +2,7 @@
 
 import json
 import time
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -288,6 +289,8 @@ def test_layers_are_hidden_and_shown(map_page):
     page.until(lambda: page.drawing["goals"] == 2)
     page.board.append_event({**history(25)[-1], "live": 1})
     page.until(lambda: page.drawing["goals"] == 1)
+    press(page, OTHER)  # rooms and landmarks are where the most probable hypothesis has them
+    page.until(lambda: (page.drawing["selected"], page.drawing["rooms"], page.drawing["landmarks"]) == (OTHER, 0, 0))
     legend = page.browser.evaluate("document.getElementById('legend').textContent")
     for title in ("Scan", "Particles", "Goals", "Marks", "Path, corrected", "Landmarks", "Room names"):
         assert title in legend
@@ -341,8 +344,14 @@ def test_texts_and_signs_have_enough_contrast_on_their_grounds(map_page, is_dark
         page.browser.dark(False)
 
 
-def test_on_a_phone_everything_is_in_one_column_and_can_be_pressed(map_page, screenshots):
+def overlaps(one, other):
+    """Whether two cards with names overlap; their height is 20 px."""
+    return abs(one["u"] - other["u"]) < one["half"] + other["half"] and abs(one["v"] - other["v"]) < 20
+
+
+def test_on_a_phone_everything_is_in_one_column_and_can_be_pressed_and_names_of_rooms_read(map_page, screenshots):
     page = map_page
+    page.board.put("rooms", [[f"room {k}", 1.0 * k, 4.0 - 8.0 * (k % 2)] for k in range(8)])
     page.board.put("controls", True)
     page.browser.open("about:blank")
     page.browser.size(390, 844, mobile=True, ratio=2.0)
@@ -356,9 +365,12 @@ def test_on_a_phone_everything_is_in_one_column_and_can_be_pressed(map_page, scr
             ".map((one) => one.id || one.className)"
         )
         assert small == []
+        page.until(lambda: page.drawing["rooms"] == 8)
+        assert not any(overlaps(*pair) for pair in combinations(page.drawing["cards"], 2))
         page.browser.screenshot(screenshots / "phone_hypotheses.png", whole=True)
     finally:
         page.board.put("controls", False)
+        page.board.put("rooms", [])
         page.browser.size(1280, 800)
         page.browser.open("about:blank")
         page.browser.open(page.url)

@@ -6,13 +6,14 @@ import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.ros import topics
+from hmt_slam_ros.ros.kernel_thread import KernelThread
 from hmt_slam_ros.ros.landmark_markers import landmark_lines, landmark_markers
-from hmt_slam_ros.ros.lifecycle import ManagedNode
 from hmt_slam_ros.ros.map_publisher import MAX_SHARE
 from hmt_slam_ros.ros.map_view import MapRenderer
 from hmt_slam_ros.ros.topics import LANDMARKS
@@ -62,9 +63,10 @@ class LandmarkExtraction:
 class LandmarkPublisher:
     """Publishes the landmarks of the most probable hypothesis as lines on a latched topic."""
 
-    def __init__(self, node: ManagedNode, configuration: Configuration) -> None:
+    def __init__(self, node: Node, kernels: KernelThread, configuration: Configuration) -> None:
+        """:param kernels: of the node."""
         self._publisher = node.create_publisher(MarkerArray, LANDMARKS, topics.LATCHED)
-        self._configuration, self._kernels = configuration, node.kernels
+        self._configuration, self._kernels = configuration, kernels
         self._extraction: LandmarkExtraction | None = None
         self._published_version, self._is_outdated = 0, False
         self._next_extraction = self._next_message = 0.0
@@ -79,7 +81,8 @@ class LandmarkPublisher:
             return
         begin = time.thread_time()
         self._is_outdated |= extraction.advance(renderer.area_keyframes())
-        if now >= self._next_message and (self._is_outdated or renderer.version != self._published_version):
+        is_changed = self._is_outdated or renderer.version != self._published_version
+        if is_changed and extraction.landmarks and now >= self._next_message:
             frames = renderer.known_area_poses()
             lines = landmark_lines((frames[a], own) for a, own in extraction.landmarks.items() if a in frames)
             self._publisher.publish(landmark_markers(lines, renderer.stamp, renderer.frame))

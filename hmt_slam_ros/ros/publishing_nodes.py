@@ -146,7 +146,7 @@ class TlcaNode(ProcessNode):
             MapPublisher(self, PathMessage, PATH, MapRenderer.path, _DATA_PERIOD),
             MapPublisher(self, String, DOCUMENTS[Topology], self._topology_document, _DATA_PERIOD),
             MapPublisher(self, String, DOCUMENTS[Alternatives], self._alternatives_document, _DATA_PERIOD),
-            LandmarkPublisher(self, self.configuration),
+            LandmarkPublisher(self, self.kernels, self.configuration),
         )
         self._ambiguity_goals = self.create_publisher(PoseStamped, AMBIGUITY_GOAL, topics.STREAM)
         self.create_timer(_CHECK_PERIOD, self._publish_if_changed, clock=self.diagnostics.steady_clock)

@@ -131,9 +131,8 @@ function drawLayers(context, camera, state, scene, robot, isLive, visible, drawn
   const areas = new Map(scene.areas.map((area) => [area.area, area.pose]));
   const marks = Object.entries(visible.marks ? state.marks ?? {} : {}).filter(([, mark]) => areas.has(mark.area));
   marks.forEach(([name, mark]) => drawSign(context, camera, compose(areas.get(mark.area), mark.at), themed("--mark"), name, false));
-  const rooms = visible.rooms && isLive ? state.rooms ?? [] : [];
-  rooms.forEach(([name, ...at]) => drawTag(context, camera, at, name));
-  Object.assign(drawn, { rooms: rooms.length, scan: scan.length / 2, particles: particles.length, goals: goals.length, marks: marks.length });
+  drawn.cards = drawRooms(context, camera, visible.rooms && isLive ? state.rooms ?? [] : []);
+  Object.assign(drawn, { rooms: drawn.cards.length, scan: scan.length / 2, particles: particles.length, goals: goals.length, marks: marks.length });
 }
 
 const LEAST = 5; // px, of a wall of a corner
@@ -164,22 +163,41 @@ function drawLandmarks(context, camera, { corners = [], convex_corners: convex =
   return (corners.length + convex.length) / 8 + openings.length / 4;
 }
 
-/** A name on a card, in the middle of a room. */
-function drawTag(context, camera, at, name) {
-  const [u, v] = camera.toScreen(at);
+const TAG = 20; // px, height of a name on its card
+const SHIFTS = [0, 1.2, 2.4, -1.2, -2.4].map((rows) => rows * TAG);
+
+/** Names on cards in the middle of their rooms, or beside that, away from the other rooms; returns the cards. */
+function drawRooms(context, camera, rooms) {
   context.font = "600 12px system-ui, sans-serif";
-  const half = context.measureText(name).width / 2 + 6;
-  context.beginPath();
-  context.roundRect(u - half, v - 10, 2 * half, 20, 5);
-  context.fillStyle = themed("--card");
-  context.globalAlpha = 0.85;
-  context.fill();
-  context.globalAlpha = 1;
-  context.strokeStyle = context.fillStyle = themed("--ink");
-  context.lineWidth = 1;
-  context.stroke();
   context.textAlign = "center";
   context.textBaseline = "middle";
+  context.lineWidth = 1;
+  const cards = [];
+  const spots = rooms.map(([name, ...at]) => [name, ...camera.toScreen(at)]);
+  const middle = spots.reduce((sum, [, , v]) => sum + v, 0) / spots.length;
+  for (const [name, u, v] of spots) {
+    const away = v < middle ? -1 : 1;
+    const half = context.measureText(name).width / 2 + 6;
+    const isFree = (w) => cards.every((card) => Math.abs(card.u - u) > card.half + half || Math.abs(card.v - w) > TAG);
+    cards.push({ name, u, v: SHIFTS.map((shift) => v + away * shift).find(isFree) ?? v, half });
+    drawCard(context, cards.at(-1), v);
+  }
+  return cards;
+}
+
+/** A card with a line to its room, where it is beside that. */
+function drawCard(context, { name, u, v, half }, room) {
+  context.strokeStyle = themed("--ink");
+  context.beginPath();
+  context.moveTo(u, room);
+  context.lineTo(u, v);
+  context.stroke();
+  context.beginPath();
+  context.roundRect(u - half, v - TAG / 2, 2 * half, TAG, 5);
+  context.fillStyle = themed("--card");
+  context.fill();
+  context.stroke();
+  context.fillStyle = themed("--ink");
   context.fillText(name, u, v + 0.5);
 }
 
