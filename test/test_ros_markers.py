@@ -1,6 +1,8 @@
 """Landmarks and names of rooms as markers: made for subscribers alone, some at a time, and sent when they change."""
 
 import math
+import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.kernel_thread import KernelThread
 from hmt_slam_ros.ros.landmark_markers import MAX_LANDMARKS, landmark_lines, landmark_markers
-from hmt_slam_ros.ros.landmark_publisher import LandmarkPublisher
+from hmt_slam_ros.ros.landmark_publisher import LandmarkExtraction, LandmarkPublisher
 from hmt_slam_ros.ros.map_view import MapRenderer, MapRendererState
 from hmt_slam_ros.ros.room_markers import RoomMarkers
 from hmt_slam_ros.ros.view_conversions import landmarks_section, rooms_section
@@ -98,6 +100,25 @@ def test_landmarks_are_extracted_for_subscribers_and_sent_again_where_the_map_ch
     publisher.invalidate()
     listener.until(lambda: publisher.publish_if_due(moved) or len(received) > count)
     assert (middles(received[-1])[:, 0] < 8.0).all()  # where the other area is, is not known
+
+
+def test_extraction_takes_some_milliseconds_for_each_keyframe():
+    """Of a laser that sees only what is ahead, whose landmarks are those of the map around."""
+    state = floor_state()
+    ahead = {
+        k: replace(scan, ranges=scan.ranges[180:540], angle_min=scan.angle_min + 180 * scan.angle_increment)
+        for k, scan in state.scans.items()
+    }
+    renderer, seconds = renderer_of(replace(state, scans=ahead)), []
+    for _ in range(2):  # kernels are loaded the first time
+        extraction = LandmarkExtraction(CONFIGURATION, renderer.scans)
+        begin = time.thread_time()
+        while len(extraction.landmarks) < len(AREAS):
+            extraction.advance(renderer.area_keyframes())
+        seconds.append(time.thread_time() - begin)
+    count = sum(map(len, renderer.area_keyframes().values()))
+    print(f"{1e3 * seconds[1] / count:.1f} ms for each of {count} keyframes")
+    assert seconds[1] / count < 0.05
 
 
 def test_rooms_are_named_where_they_are_and_sent_again_where_they_moved():

@@ -57,7 +57,7 @@ from hmt_slam_ros.sensors import Scan
 BUNDLED = Path(__file__).resolve().parent.parent / "data" / "malaga_one_loop"
 PROCESSES = process_names()
 ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL)
-TIMED = {"nodes", "topics", "incidents", "past", "events"}
+TIMED = {"nodes", "topics", "incidents", "past", "events", "landmarks"}
 """Sections of the page that change while nothing happens, or depend on when the page is updated."""
 DESKTOP, PHONE = (1280, 800), (390, 844)
 
@@ -165,7 +165,7 @@ def assert_screens(page, port, screenshots):
 def assert_recorded_page(recording, view, live_port):
     """The page of the bag shows what the live one does."""
     with urlopen(f"http://127.0.0.1:{live_port}/news", timeout=20):
-        wait_for(lambda: "map" in snapshot(live_port), view)
+        wait_for(lambda: {"map", "landmarks"} <= snapshot(live_port).keys(), view)
     recording.close()
     live, port = snapshot(live_port), free_port()
     with preloaded.start(preloaded.COMMAND, "view", recording.folder, "--rate", "0", "--port", port) as viewer:

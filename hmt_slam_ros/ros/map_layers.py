@@ -117,7 +117,7 @@ class MapLayers:
         self._topologies = MapDocuments(Topology, self.sections.add_topology, diagnostics)
         self._alternatives = MapDocuments(Alternatives, self.sections.add_alternatives, diagnostics)
         self._watched: list[Any] = []
-        self._rooms: dict[str, list[list[Any]]] = dict.fromkeys(ROOMS, [])
+        self._rooms: dict[str, list[list[Any]]] = {name: [] for name in ROOMS}
         subscribe(String, DOCUMENTS[Topology], self._topologies.keep, topics.LATCHED)
         on_evidence = document_callback(diagnostics, Evidence, self.sections.add_evidence)
         subscribe(String, DOCUMENTS[Evidence], on_evidence, topics.LATCHED)

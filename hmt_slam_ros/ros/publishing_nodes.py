@@ -60,7 +60,8 @@ if TYPE_CHECKING:
     from hmt_slam_ros.loop_closure.tlca import Tlca
     from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
-_RENDERER_STATE = "view"
+_RENDERER_STATE, _EVIDENCE = "view", "evidence"
+"""Names of documents in a checkpoint."""
 _AMBIGUITY = "ambiguity"
 """Name of the value in /diagnostics."""
 _CHECK_PERIOD = 1.0
@@ -93,9 +94,21 @@ class TsbiNode(ProcessNode):
             if isinstance(output, Hypotheses):
                 self._pmf.publish(pmf_message(output))
         if self.process.evidence is not self._published_evidence:
-            self._published_evidence = self.process.evidence
-            document = encode(self._published_evidence, self.reset_number, self.diagnostics.system.name)
-            self._evidence_publisher.publish(String(data=document))
+            self._publish_evidence()
+
+    def _publish_evidence(self) -> None:
+        self._published_evidence = self.process.evidence
+        document = encode(self._published_evidence, self.reset_number, self.diagnostics.system.name)
+        self._evidence_publisher.publish(String(data=document))
+
+    def node_state(self) -> dict[str, object]:
+        """The evidence, which people read."""
+        return {_EVIDENCE: self.process.evidence}
+
+    def restore_node_state(self, folder: Path) -> None:
+        """Restore the evidence, and publish it for those who come later."""
+        self.process.restore_evidence(FolderReader(folder, CHECKPOINT, VERSION).read(_EVIDENCE, Evidence))
+        self._publish_evidence()
 
     def _on_statement(self, message: String) -> None:
         """Deliver what a person states about two areas."""

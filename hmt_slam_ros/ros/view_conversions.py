@@ -100,8 +100,8 @@ def rooms_section(message: MarkerArray) -> list[list[Any]]:
     _check_count(message)
     texts = [marker for marker in message.markers if marker.type == Marker.TEXT_VIEW_FACING and marker.text]
     if len(texts) > _MAX_ROOMS:
-        raise HmtSlamError(f"{len(texts)} rooms are too many to be shown: look who publishes them")
-    return [[shorten(marker.text), *_rounded(marker.pose.position)] for marker in texts]
+        raise HmtSlamError(f"{len(texts)} rooms are too many to be shown: look who publishes it")
+    return [[shorten(marker.text), *_round_position(marker.pose.position)] for marker in texts]
 
 
 def landmarks_section(message: MarkerArray) -> dict[str, list[int]]:
@@ -118,18 +118,18 @@ def landmarks_section(message: MarkerArray) -> dict[str, list[int]]:
             size, count = POINTS_PER_LANDMARK[marker.ns], len(marker.points)
             if count % size or count > size * MAX_LANDMARKS:
                 raise HmtSlamError(
-                    f"{count} points of {marker.ns} are none of landmarks, or too many: look who publishes them"
+                    f"{count} points of {marker.ns} are none of landmarks, or too many: look who publishes it"
                 )
-            found[marker.ns] = [round(100.0 * value) for point in marker.points for value in _rounded(point)]
+            found[marker.ns] = [round(100.0 * value) for point in marker.points for value in _round_position(point)]
     return found
 
 
 def _check_count(message: MarkerArray) -> None:
     if len(message.markers) > _MAX_MARKERS:
-        raise HmtSlamError(f"{len(message.markers)} markers are too many to be shown: look who publishes them")
+        raise HmtSlamError(f"{len(message.markers)} markers are too many to be shown: look who publishes it")
 
 
-def _rounded(point: Point) -> list[float]:
+def _round_position(point: Point) -> list[float]:
     """x and y of a point, m."""
     return [round(finite(value, "position", MAX_COORDINATE), 3) for value in (point.x, point.y)]
 

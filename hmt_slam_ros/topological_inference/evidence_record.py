@@ -17,7 +17,7 @@ _MAX_STEPS = 20
 
 
 class EvidenceRecord:
-    """The steps of the live hypotheses. No part of a state: a restarted process begins without.
+    """The steps of the live hypotheses. No part of the state of the process, whose decisions do not depend on it.
 
     :ivar evidence: the message, which is replaced when a step is new or a hypothesis ends.
     """
@@ -25,6 +25,11 @@ class EvidenceRecord:
     def __init__(self) -> None:
         self.evidence = Evidence(0)
         self._steps: dict[int, tuple[BranchStep, ...]] = {}
+
+    def restore(self, evidence: Evidence) -> None:
+        """Go on from the message of a process that was killed."""
+        self.evidence = evidence
+        self._steps = {one.hypothesis: one.steps for one in evidence.hypotheses}
 
     def after_event(
         self, sequence: int, maps: Mapping[int, HybridMap], hypotheses: Sequence[Hypothesis], children: Sequence[Child]

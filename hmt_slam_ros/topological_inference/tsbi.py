@@ -145,6 +145,10 @@ class Tsbi:
         """Why there are several hypotheses; the same object until that changes."""
         return self._evidence.evidence
 
+    def restore_evidence(self, evidence: Evidence) -> None:
+        """Go on from the evidence that belongs to the state with which the process began."""
+        self._evidence.restore(evidence)
+
     @property
     def state(self) -> TsbiState:
         """The state between two keyframe events."""
