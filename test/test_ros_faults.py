@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from conftest import Listener
 from logs_for_nodes import BEAMS, LASER, PACE, SECOND, START, Corridor, corridor_bag
+from ring_for_tsbi import RING, Run, ring_drive
 from test_ros_localization import NODES, SCANS, Nodes, assert_true
+from test_ros_quarantine import poison
+from test_topological_inference_ring import DRIFT
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
@@ -23,9 +26,14 @@ from std_srvs.srv import Trigger
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.documents import ResetRequest, ResetResponse, decode, encode
-from hmt_slam_ros.messages.messages import LocalEstimate
+from hmt_slam_ros.messages.evidence import Evidence
+from hmt_slam_ros.messages.messages import AreaEvents, ClosureDecision, Keyframe, LocalEstimate
+from hmt_slam_ros.messages.system_name import SystemName
 from hmt_slam_ros.process_table import participant_names
 from hmt_slam_ros.ros import conversions, topics
+from hmt_slam_ros.ros.diagnostics import NodeDiagnostics
+from hmt_slam_ros.ros.guarded_node import GuardedNode
+from hmt_slam_ros.ros.message_io import Outbox
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, MAP, ODOM, POSE, ROBOT_STATUS, SCAN, TFMessage
 from hmt_slam_ros.saved_map.folder import FORMAT, VERSION, FolderReader
 from hmt_slam_ros.sensors import Odometry, Scan
@@ -414,3 +422,42 @@ def test_two_robots_that_drive_at_once_under_namespaces_share_nothing_but_a_tf_t
         assert name.startswith(("/one/", "/two/", "/listener/")), name
     kept = {path.name for path in tmp_path.iterdir() if not path.name.startswith("log_")}
     assert kept == {f"{top}.{name}" for top in ("one", "two") for name in NODES}
+
+
+@pytest.fixture
+def sender(listener):
+    """A node that plays slam, aam and tlca for tsbi."""
+    node = GuardedNode("sender", context=listener.context)
+    node.diagnostics = NodeDiagnostics(node, SystemName(""))
+    yield Outbox(node, (Keyframe, AreaEvents, ClosureDecision))
+    node.destroy_node()
+
+
+@pytest.mark.long
+def test_what_speaks_for_hypotheses_outlives_two_kills_of_tsbi(sender, listener, start, tmp_path):
+    """By the journal, and by a checkpoint, which a journal with an entry that cannot be read makes due."""
+    played, run = [], Run(RING, DRIFT, field_of_view=2 * np.pi, beams=241)
+    handle = run.tsbi.handle
+    run.tsbi.handle = lambda message: played.append(message) or handle(message)
+    for k, pose in enumerate(ring_drive(106)):
+        answer = run.keyframe(pose, cut=7 if k and k % 14 == 0 else 0)
+        if k <= 95 and len(answer.hypotheses) > 1:
+            run.accept(run.replica.best_hypothesis)
+        else:
+            run.tsbi.handle(ClosureDecision(k))
+    expected = encode(run.tsbi.evidence)
+    assert len(run.tsbi.evidence.hypotheses) == 2
+    received = listener.subscribe(String, DOCUMENTS[Evidence], topics.LATCHED)
+    node = start("tsbi", recovery=tmp_path)
+    for message in played:
+        sender.send(message)
+    listener.until(lambda: received and received[-1].data == expected, alive=[node])
+    for change in (lambda last: [{**last, "value": {"of": "an older version"}}], None):
+        kill(node)
+        if change is not None:
+            poison(tmp_path, change, "tsbi")
+        received.clear()
+        node = start("tsbi", recovery=tmp_path)
+        listener.until(lambda: received and received[-1].data == expected, alive=[node])
+    (generation,) = (path for path in (tmp_path / "tsbi").iterdir() if path.name.isdecimal())
+    assert (generation / "state" / "evidence.json").exists()

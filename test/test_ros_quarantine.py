@@ -119,9 +119,9 @@ def test_a_process_that_cannot_be_rebuilt_goes_on_as_it_is_and_asks_for_a_restar
     node.kill()
 
 
-def poison(folder, change):
+def poison(folder, change, name=NAME):
     """Append an entry to the journal of a killed node: its last one, changed."""
-    (generation,) = (path for path in (folder / NAME).iterdir() if path.name.isdecimal())
+    (generation,) = (path for path in (folder / name).iterdir() if path.name.isdecimal())
     journal = max(generation.glob("*.jsonl"), key=lambda path: int(path.stem))
     last = json.loads(journal.read_text().splitlines()[-1])
     with journal.open("a") as file:
