@@ -13,10 +13,11 @@ import pytest
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import Point, PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Float64, String
+from visualization_msgs.msg import Marker, MarkerArray
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -56,6 +57,23 @@ def topology(stamp=5, keyframes=1):
 
 def laser(angle=0.1, range_max=30.0, beams=3):
     return LaserScan(angle_min=-0.1, angle_increment=angle, range_max=range_max, ranges=[1.0] * beams)
+
+
+def marker_publishers(node):
+    """A function that publishes a landmark and a room at an x."""
+    landmarks, rooms = (
+        node.create_publisher(MarkerArray, topic, topics.LATCHED)
+        for topic in (topics.LANDMARKS, topics.ROOMS["explorer"])
+    )
+
+    def publish(x):
+        corner = Marker(ns="corners", type=Marker.LINE_LIST, points=[Point(x=x)] * 4)
+        room = Marker(type=Marker.TEXT_VIEW_FACING, text="room 1")
+        room.pose.position.x = x
+        landmarks.publish(MarkerArray(markers=[corner]))
+        rooms.publish(MarkerArray(markers=[room]))
+
+    return publish
 
 
 @pytest.fixture(autouse=True)
@@ -142,11 +160,13 @@ def test_the_node_survives_what_a_stranger_says_counts_it_and_shows_what_is_well
     entropies = node.create_publisher(Float64, topics.ENTROPY, topics.LATCHED)
     statuses = node.create_publisher(String, topics.ROBOT_STATUS, topics.LATCHED)
     health = node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, topics.STREAM)
+    publish_markers = marker_publishers(node)
     # Latched: the node receives these when it starts.
     maps.publish(grid(0, 0, 0))
     graphs.publish(String(data="hello"))
     entropies.publish(Float64(data=NAN))
     statuses.publish(String(data="hello"))
+    publish_markers(NAN)
     port = free_port()
     view = start("view", port=port, controls="true")
     reports = listener.subscribe(DiagnosticArray, topics.DIAGNOSTICS, topics.STREAM)
@@ -158,7 +178,8 @@ def test_the_node_survives_what_a_stranger_says_counts_it_and_shows_what_is_well
     latched = {f"refused on {topic}" for topic in (topics.DOCUMENTS[Topology], topics.ENTROPY, topics.ROBOT_STATUS)}
     listener.until(lambda: latched <= counts().keys(), alive=[view])
     with urlopen(f"http://127.0.0.1:{port}/news", timeout=20):  # a browser is there, so it subscribes to the map
-        listener.until(lambda: f"refused on {topics.MAP}" in counts(), alive=[view])
+        watched = {f"refused on {topic}" for topic in (topics.MAP, topics.LANDMARKS, topics.ROOMS["explorer"])}
+        listener.until(lambda: watched <= counts().keys(), alive=[view])
         for message in BAD_GRIDS:
             maps.publish(message)
             listener.spin(0.25)
@@ -177,14 +198,17 @@ def test_the_node_survives_what_a_stranger_says_counts_it_and_shows_what_is_well
             listener.spin(0.25)
         listener.until(lambda: counts().get(f"refused on {topics.HMT_POSE}", 0) > 0, alive=[view])
         assert counts()[f"refused on {topics.POSE}"] > 1
-        assert not snapshot(port).keys() & {"robot", "map", "graph", "entropy", "replay"}
+        assert not snapshot(port).keys() & {"robot", "map", "graph", "entropy", "replay", "landmarks", "rooms"}
         poses.publish(pose(4.0))
         maps.publish(grid())
         graphs.publish(String(data=encode(topology())))
         entropies.publish(Float64(data=0.25))
-        listener.until(lambda: {"robot", "map", "graph", "entropy"} <= snapshot(port).keys(), alive=[view])
-    assert snapshot(port)["robot"]["pose"] == [4.0, 0.0, 0.0]
-    assert snapshot(port)["entropy"] == 0.25
+        publish_markers(1.0)
+        shown = {"robot", "map", "graph", "entropy", "landmarks", "rooms"}
+        listener.until(lambda: shown <= snapshot(port).keys(), alive=[view])
+    known = snapshot(port)
+    assert (known["robot"]["pose"], known["entropy"]) == ([4.0, 0.0, 0.0], 0.25)
+    assert (known["landmarks"]["corners"], known["rooms"]) == ([100, 0] * 4, [["room 1", 1.0, 0.0]])
     assert_commands(listener, view, port)
 
 
