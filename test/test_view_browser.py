@@ -367,6 +367,10 @@ def test_on_a_phone_everything_is_in_one_column_and_can_be_pressed_and_names_of_
         assert small == []
         page.until(lambda: page.drawing["rooms"] == 8)
         assert not any(overlaps(*pair) for pair in combinations(page.drawing["cards"], 2))
+        layers = "document.getElementById('layers')"
+        page.browser.evaluate(f"{layers}.open = true")
+        assert page.browser.evaluate(f"{layers}.scrollHeight - {layers}.clientHeight") == 0
+        page.browser.evaluate(f"{layers}.open = false")
         page.browser.screenshot(screenshots / "phone_hypotheses.png", whole=True)
     finally:
         page.board.put("controls", False)
