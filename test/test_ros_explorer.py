@@ -82,6 +82,7 @@ def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listene
     listener.until(lambda: len(outcomes) > 1, alive=nodes)
     assert outcomes[1].data.startswith("go cellar: there is no such place: choose from")
     assert outcomes[1].data.endswith(" room 1, area 0")
+    listener.until(lambda: len(rooms[-1].markers) > 1, alive=nodes)  # it is published once a second
     assert_room_is_the_arm(rooms[-1])
     goals_.publish(String(data="go area 0"))
     listener.until(lambda: len(outcomes) > 2, alive=nodes)

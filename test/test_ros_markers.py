@@ -100,6 +100,9 @@ def test_landmarks_are_extracted_for_subscribers_and_sent_again_where_the_map_ch
     publisher.invalidate()
     listener.until(lambda: publisher.publish_if_due(moved) or len(received) > count)
     assert (middles(received[-1])[:, 0] < 8.0).all()  # where the other area is, is not known
+    publisher.invalidate()  # as after a reset
+    empty = MapRenderer(CONFIGURATION, "map", MapRendererState())
+    listener.until(lambda: publisher.publish_if_due(empty) or len(middles(received[-1])) == 0)
 
 
 def test_extraction_takes_some_milliseconds_for_each_keyframe():

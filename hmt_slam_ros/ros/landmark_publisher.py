@@ -48,7 +48,7 @@ class LandmarkExtraction:
     def advance(self, areas: Mapping[int, Mapping[int, Float64]]) -> bool:
         """Extract some landmarks, and say whether those of any area changed.
 
-        :param areas: {area: {keyframe: ``area_T_base`` (3,)}}; the last of them may grow at no cost.
+        :param areas: {area: {keyframe: ``area_T_base`` (3,)}}; that of the last goes on where the area grew.
         """
         self._cache.prefetch(areas.items(), _KEYFRAMES_AT_ONCE)
         views, before = self._cache.cached_views(areas), self.landmarks
@@ -73,16 +73,16 @@ class LandmarkPublisher:
 
     def publish_if_due(self, renderer: MapRenderer) -> None:
         """Extract some landmarks while there are subscribers, and publish all where they changed and it is time."""
-        now = time.monotonic()
-        if now < self._next_extraction or not self._publisher.get_subscription_count() or not renderer.version:
+        now, has_map = time.monotonic(), self._is_outdated or renderer.version > 0
+        if now < self._next_extraction or not self._publisher.get_subscription_count() or not has_map:
             return
         extraction = self._extraction_of(renderer)
         if not self._kernels.is_done:
             return
         begin = time.thread_time()
         self._is_outdated |= extraction.advance(renderer.area_keyframes())
-        is_changed = self._is_outdated or renderer.version != self._published_version
-        if is_changed and extraction.landmarks and now >= self._next_message:
+        is_changed = self._is_outdated or (extraction.landmarks and renderer.version != self._published_version)
+        if is_changed and now >= self._next_message:
             frames = renderer.known_area_poses()
             lines = landmark_lines((frames[a], own) for a, own in extraction.landmarks.items() if a in frames)
             self._publisher.publish(landmark_markers(lines, renderer.stamp, renderer.frame))
