@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_slam_ros.exploration.laser_views import LaserViews
 from hmt_slam_ros.exploration.local_motion import MotionLimits, command_towards
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
@@ -101,12 +102,14 @@ def motion_limits(settings: WorldSettings) -> MotionLimits:
 
 def _drive_to(robot: DrivenRobot, goal: NDArray[np.float64], limits: MotionLimits) -> bool:
     """Drive to a goal; return whether the robot arrives in time."""
-    end = robot.stamp + round(_TIME * NANOSECONDS)
+    end, views, before = robot.stamp + round(_TIME * NANOSECONDS), LaserViews(), robot.pose
     while robot.stamp < end:
         scan = robot.measure()[1]
         if scan is not None:
             ahead = se2.transform(se2.inverse(robot.pose), goal[None])[0]
-            command = command_towards(scan, ahead, robot.velocity, limits)
+            views.move(se2.between(before, robot.pose))
+            before = robot.pose
+            command = command_towards(views.add(scan), ahead, robot.velocity, limits)
             if command.arrived:
                 return True
             robot.set_velocity(command.speed, command.turn_rate)

@@ -15,6 +15,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import Explorer
+from hmt_slam_ros.exploration.laser_views import LaserViews, ObstacleView
 from hmt_slam_ros.exploration.local_motion import MotionCommand, MotionLimits, command_towards
 from hmt_slam_ros.exploration.look_planner import LookPlanner
 from hmt_slam_ros.exploration.path_follower import PathFollower
@@ -58,6 +59,11 @@ def scan_at(pose: tuple[float, float, float]) -> Scan:
     """What a laser all around sees of that floor."""
     laser = Laser(LASER)
     return laser.scan(0, 0, laser.distances(np.array([pose]), wall_index(small_floor().walls), np.empty((0, 3))))
+
+
+def view_of(scan: Scan) -> ObstacleView:
+    """What a robot with one laser sees."""
+    return LaserViews().add(scan)
 
 
 def with_keyframes(poses: dict[int, tuple[float, float, float]]) -> HybridMap:
@@ -335,15 +341,17 @@ def test_same_seed_same_path_bit_for_bit() -> None:
 def test_it_does_not_aim_behind_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
     aims: list[Float64] = []
 
-    def drive_command(scan: Scan, goal: Float64, velocity: tuple[float, float], limits: MotionLimits) -> MotionCommand:
+    def drive_command(
+        view: ObstacleView, goal: Float64, velocity: tuple[float, float], limits: MotionLimits
+    ) -> MotionCommand:
         aims.append(goal)
-        return command_towards(scan, goal, velocity, limits)
+        return command_towards(view, goal, velocity, limits)
 
     monkeypatch.setattr("hmt_slam_ros.exploration.path_follower.command_towards", drive_command)
     # From the northern arm around the eastern corner; the wall of the arm is at x = 7 up to y = 1.
     at = np.array([6.6, 1.6, 0.0])
     way = se2.transform(se2.inverse(at), np.array([(6.6, 1.6), (6.6, 0.5), (8.5, 0.5)]))
-    PathFollower(MotionLimits(0.6, 0.8, 0.5, 1.5, 0.25), 0.15).steer(scan_at((6.6, 1.6, 0.0)), way, (0.0, 0.0))
+    PathFollower(MotionLimits(0.6, 0.8, 0.5, 1.5, 0.25), 0.15).steer(view_of(scan_at((6.6, 1.6, 0.0))), way, (0.0, 0.0))
     aim = se2.transform(at, aims[0])
     assert aim[0] < 7.4
     assert np.interp(7.0, (6.6, aim[0]), (1.6, aim[1])) < 1.0 or aim[0] < 7.0
@@ -356,7 +364,7 @@ def test_it_waits_for_who_stands_in_its_way_and_then_goes_around() -> None:
 
     def speed(seconds: float, people: Float64) -> float:
         scan = laser.scan(0, 0, laser.distances(np.array([(2.0, 0.0, 0.0)]), walls, people))
-        command = pilot.steer(replace(scan, stamp=1 + round(seconds * NANOSECONDS)), way, (0.0, 0.0))
+        command = pilot.steer(view_of(replace(scan, stamp=1 + round(seconds * NANOSECONDS))), way, (0.0, 0.0))
         return abs(command.speed) + abs(command.turn_rate)
 
     assert [speed(seconds, person) == 0.0 for seconds in (0.0, 2.0, 3.9)] == [True] * 3
@@ -369,7 +377,7 @@ def test_no_progress_for_long_is_noticed(seconds: float, stuck: bool) -> None:
     pilot = PathFollower(MotionLimits(0.6, 0.8, 0.5, 1.5, 0.25), 0.15)
     scan, way = scan_at((6.0, 0.0, 0.0)), np.array([[0.0, 0.0], [3.0, 0.0]])
     begin = Scan(1, scan.ranges, scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max)
-    assert pilot.steer(begin, way, (0.0, 0.0)).speed > 0.0
+    assert pilot.steer(view_of(begin), way, (0.0, 0.0)).speed > 0.0
     assert not pilot.has_arrived
     assert pilot.is_stuck(1 + round(seconds * NANOSECONDS), 15 * NANOSECONDS) == stuck
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmark.driving import drive_goals, scenario_of
+from hmt_slam_ros.exploration.laser_views import LaserViews
 from hmt_slam_ros.exploration.local_motion import (
     _MAX_FREE_DISTANCE,
     MotionLimits,
@@ -26,7 +27,7 @@ def scan_of(points, beams=720):
     for x, y in points:
         beam = round((math.atan2(y, x) + math.pi) / (2.0 * math.pi) * beams) % beams
         ranges[beam] = min(ranges[beam], math.hypot(x, y))
-    return Scan(0, ranges, -math.pi, 2.0 * math.pi / beams, 0.02, 20.0)
+    return LaserViews().add(Scan(0, ranges, -math.pi, 2.0 * math.pi / beams, 0.02, 20.0))
 
 
 def wall(start, end):

@@ -10,9 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
+import numpy as np
+
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.exploration.exploration_map import ExplorationMap
+from hmt_slam_ros.exploration.laser_views import LaserViews, ObstacleView
 from hmt_slam_ros.exploration.local_motion import turn_in_place
 from hmt_slam_ros.exploration.look_planner import LookPlanner
 from hmt_slam_ros.exploration.path_follower import PathFollower, Route, motion_limits
@@ -78,7 +81,7 @@ class Explorer:
         self._target: Frontier | None = None
         self._route: Route | None = None
         self._path_follower = PathFollower(self._limits, _PLACE_TOLERANCE)
-        self._velocity = _STAND
+        self._velocity, self._views = _STAND, LaserViews()
         # Reached frontiers, and those given up: each a point in the frame of a keyframe.
         self._reached_frontiers: list[tuple[int, Float64]] = []
         self._abandoned_frontiers: list[tuple[int, Float64]] = []
@@ -120,6 +123,8 @@ class Explorer:
     def _drive(self, scan: Scan) -> list[Message]:
         """Choose a goal if there is none, and follow the route."""
         outputs: list[Message] = []
+        self._move_views(scan.stamp)
+        view = self._views.add(scan)
         ready = self.exploration_map.is_localized(scan.stamp)
         self.exploration_map.teammates.update(scan.stamp)
         self._look_planner.update(self.exploration_map.event)
@@ -128,8 +133,15 @@ class Explorer:
                 self._route = None
             if self._route is None:
                 outputs += self._choose_goal(self.task, scan.stamp)
-        self._velocity = self._follow_route(scan, outputs) if ready and self._route is not None else _STAND
+        self._velocity = self._follow_route(view, outputs) if ready and self._route is not None else _STAND
         return [*outputs, VelocityCommand(scan.stamp, *self._velocity)]
+
+    def _move_views(self, stamp: int) -> None:
+        """Move the robot by its last command until a time, ns."""
+        last = self._views.newest_stamp
+        if last is not None and last < stamp <= last + NANOSECONDS:
+            speed, turn_rate = self._velocity
+            self._views.move(se2.exp((stamp - last) / NANOSECONDS * np.array([speed, 0.0, turn_rate])))
 
     def _keeps_route(self) -> bool:
         """Whether the route is still valid after a change of the map."""
@@ -160,13 +172,13 @@ class Explorer:
         may_look = self._is_exploring and self._disambiguates and self._look_planner.is_open
         return may_look and self._look_planner.has_look(self.exploration_map.keyframe_locator)
 
-    def _follow_route(self, scan: Scan, outputs: list[Message]) -> tuple[float, float]:
+    def _follow_route(self, view: ObstacleView, outputs: list[Message]) -> tuple[float, float]:
         """The velocities along the route; messages at its end are added to ``outputs``."""
         assert self._route is not None
-        command = self._path_follower.steer(scan, self.exploration_map.route_in_base(self._route), self._velocity)
+        command = self._path_follower.steer(view, self.exploration_map.route_in_base(self._route), self._velocity)
         if self._goal is not None and self._path_follower.has_arrived:
             return self._turn_to_goal(self._goal, outputs)
-        if self._path_follower.has_arrived or self._path_follower.is_stuck(scan.stamp, self._stuck_timeout):
+        if self._path_follower.has_arrived or self._path_follower.is_stuck(view.stamp, self._stuck_timeout):
             # A frontier is visible from beside it.
             near = self._is_exploring and self._path_follower.remaining <= _BESIDE_FRONTIER
             outputs += self._finish_route(reached=self._path_follower.has_arrived or near)

@@ -1,6 +1,6 @@
-"""Local motion: obstacle avoidance with the dynamic window, along a short path around the surfaces of a scan.
+"""Local motion: obstacle avoidance with the dynamic window, along a short path around the surfaces in view.
 
-1. A shortest path to the goal is searched in a grid of the scan (`local_goal`). Cells cost more near surfaces, so that
+1. A shortest path to the goal is searched in a grid of these (`local_goal`). Cells cost more near surfaces, so that
    paths pass the middle of doors, and outside the field of view. This keeps the dynamic window out of dead ends, as in
    Brock and Khatib (1999), High-speed navigation using the global dynamic window approach.
 2. Of the velocities within reach until the next command, those are admissible from which the robot can stop before a
@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.compilation import njit
+from hmt_slam_ros.exploration.laser_views import ObstacleView
 from hmt_slam_ros.geometry.se2 import exp_shift
-from hmt_slam_ros.sensors import Scan
 
 _CELL = 0.1
 """Side of a cell, m."""
@@ -205,21 +205,21 @@ class MotionCommand(NamedTuple):
 
 
 def command_towards(
-    scan: Scan, goal: NDArray[np.float64], velocity: tuple[float, float], limits: MotionLimits
+    view: ObstacleView, goal: NDArray[np.float64], velocity: tuple[float, float], limits: MotionLimits
 ) -> MotionCommand:
-    """The velocities towards a goal around the surfaces of a scan.
+    """The velocities towards a goal around the surfaces in view.
 
     Hidden surfaces are unknown, and nothing is remembered. So goals should be visible, or nearly.
 
-    :param scan: of any field of view; directions without a return are taken to be free.
+    :param view: of any field; directions without a return are taken to be free.
     :param goal: shape (2,), m, the robot's frame.
     :param velocity: of the robot now, m/s and rad/s.
     """
     if math.hypot(goal[0], goal[1]) <= limits.tolerance:
         return MotionCommand(0.0, 0.0, arrived=True)
     radius = limits.radius + limits.margin
-    ahead = local_goal(scan.points, goal, radius, _field_of_view(scan))
-    near = scan.points[np.hypot(*scan.points.T) < _MAX_FREE_DISTANCE + radius]
+    ahead = local_goal(view.points, goal, radius, view.field)
+    near = view.points[np.hypot(*view.points.T) < _MAX_FREE_DISTANCE + radius]
     window = _dynamic_window(velocity, math.hypot(goal[0], goal[1]) - 0.5 * limits.tolerance, limits)
     speed, turn_rate = _best_velocity(near, ahead, window, radius, limits.period, limits.acceleration)
     return MotionCommand(speed, turn_rate, arrived=False)
@@ -229,16 +229,6 @@ def turn_in_place(angle: float, limits: MotionLimits) -> MotionCommand:
     """The command for a turn on the spot by an angle, rad."""
     rate = min(limits.turn_rate, math.sqrt(2.0 * limits.turn_acceleration * abs(angle)), abs(angle) / limits.period)
     return MotionCommand(0.0, math.copysign(rate, angle), arrived=False)
-
-
-def _field_of_view(scan: Scan) -> float:
-    """Largest bearing to both sides of the robot within the field of view, rad."""
-    first, last = scan.angle_min, scan.angle_min + scan.angle_increment * (scan.ranges.size - 1)
-    gap = abs(scan.angle_increment)
-    if abs(last - first) + 1.5 * gap >= 2.0 * math.pi:
-        return math.pi
-    turn = float(scan.laser_pose[2])
-    return max(0.0, min(max(first, last) + turn, -min(first, last) - turn)) + gap
 
 
 def _dynamic_window(velocity: tuple[float, float], remaining: float, limits: MotionLimits) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.exploration.laser_views import LaserViews, ObstacleView
 from hmt_slam_ros.exploration.local_motion import MotionCommand, MotionLimits, command_towards, turn_in_place
 from hmt_slam_ros.exploration.path_follower import PathFollower
 from hmt_slam_ros.exploration.rooms import Destination, KnownBuilding, RoomFilter
@@ -117,7 +118,7 @@ class MissionController:
         self._progress_stamp, self._progress = 0, -math.inf
         self._observation_stamp, self._observation_displacement, self._has_turned_back = 0, _INITIAL_DISPLACEMENT, False
         self._path_follower = PathFollower(limits, _PLACE_TOLERANCE)
-        self._velocity = (0.0, 0.0)
+        self._velocity, self._views = (0.0, 0.0), LaserViews()
         self._behaviors = {
             Phase.HALLWAY: self._follow_hallway,
             Phase.TURN: self._turn_at_node,
@@ -154,19 +155,24 @@ class MissionController:
     def predict(self, step: RelativeMotion) -> None:
         """Move the robot."""
         self.estimator.predict(step)
+        self._views.move(step.increment)
         self._observation_displacement = se2.compose(self._observation_displacement, step.increment)
         if self.room is not None:
             self.room.predict(step)
 
     def steer(self, scan: Scan) -> MotionCommand:
-        """The velocities until the next scan."""
-        if self.room is None:
+        """The velocities until the next scan.
+
+        Around obstacles in view of any laser. Places are seen ahead and beside.
+        """
+        view = self._views.add(scan)
+        if self.room is not None:
+            self.room.observe(scan)
+        elif self._views.is_ahead(scan):
             self.estimator.observe(scan)
             self._observe_edges(scan.stamp)
-        else:
-            self.room.observe(scan)
         behavior = self._behaviors.get(self.phase)
-        command = _STAND if behavior is None else behavior(scan)
+        command = _STAND if behavior is None else behavior(view)
         self._velocity = command.speed, command.turn_rate
         return command
 
@@ -194,10 +200,10 @@ class MissionController:
         belief = self.estimator.belief
         return belief.most_likely_state if belief is not None and belief.is_confident else None
 
-    def _command_towards(self, scan: Scan, point: Float64) -> MotionCommand:
-        return command_towards(scan, point, self._velocity, self._limits)
+    def _command_towards(self, view: ObstacleView, point: Float64) -> MotionCommand:
+        return command_towards(view, point, self._velocity, self._limits)
 
-    def _follow_hallway(self, scan: Scan) -> MotionCommand:
+    def _follow_hallway(self, view: ObstacleView) -> MotionCommand:
         """Keep to the middle of the hallway, and decide at nodes.
 
         A robot that an obstacle turned off its axis turns back, unless it arrived at a node.
@@ -206,19 +212,19 @@ class MissionController:
         arrived = event[0] != self._last_event[0]
         if (self.estimator.frame.travel_axis - self._target_axis) % QUARTERS and not arrived:
             self.phase = Phase.TURN
-            return self._turn_at_node(scan)
+            return self._turn_at_node(view)
         self._target_axis = self.estimator.frame.travel_axis
         returned = self._has_turned_back and self.estimator.frame.distance_past_node >= -_NODE_MARGIN
         if arrived or event[1] > self._last_event[1] or returned:
-            self._decide(scan)
+            self._decide(view)
         self._last_event = event
         if self.phase is not Phase.HALLWAY:
-            return self._behaviors[self.phase](scan)
-        if self._is_stuck(scan):
+            return self._behaviors[self.phase](view)
+        if self._is_stuck(view):
             self._escape()
         elif self._is_way_closed():
             self._turn_back()
-        return self._command_towards(scan, self.estimator.frame.center_point_ahead_in_base(_LOOKAHEAD))
+        return self._command_towards(view, self.estimator.frame.center_point_ahead_in_base(_LOOKAHEAD))
 
     def _is_way_closed(self) -> bool:
         """Whether the robot's edge is closed, and another path leads to the goal."""
@@ -243,16 +249,16 @@ class MissionController:
             self._set_turn(self._freest_quarter(0))
             self.phase = Phase.TURN
 
-    def _is_stuck(self, scan: Scan) -> bool:
+    def _is_stuck(self, view: ObstacleView) -> bool:
         """Whether the robot made no progress along its axis within the timeout."""
         position = self.estimator.frame.coordinate_along(self._target_axis)
         progressed = position >= self._progress + _MIN_PROGRESS
-        stuck = not progressed and scan.stamp - self._progress_stamp > _STUCK_TIMEOUT
+        stuck = not progressed and view.stamp - self._progress_stamp > _STUCK_TIMEOUT
         if stuck or progressed:
-            self._progress, self._progress_stamp = position, scan.stamp
+            self._progress, self._progress_stamp = position, view.stamp
         return stuck
 
-    def _decide(self, scan: Scan) -> None:
+    def _decide(self, view: ObstacleView) -> None:
         """Follow the most likely state policy; without its answer go straight on, or back at a wall."""
         belief, facing, goal = self.estimator.belief, self.estimator.node_and_direction, self._goal
         node = None if goal is None else goal.node
@@ -262,7 +268,7 @@ class MissionController:
             return
         if goal is not None and self._is_confident and facing is not None and facing[0] == node:
             self._hallway_axis = self.estimator.frame.travel_axis
-            self._start_door_approach(goal.opening.direction - facing[1], scan)
+            self._start_door_approach(goal.opening.direction - facing[1], view)
             return
         closed = self.edge_monitor.closed_states
         quarters = None if belief is None else next_turn(belief, node, self._model, ahead=not at_wall, closed=closed)
@@ -286,21 +292,21 @@ class MissionController:
         """Set the axis some quarters to the right as target."""
         self._target_axis, self._progress = self.estimator.frame.travel_axis - quarters, -math.inf
 
-    def _start_door_approach(self, quarters: int, scan: Scan) -> None:
+    def _start_door_approach(self, quarters: int, view: ObstacleView) -> None:
         """Begin to turn some quarters to the right, to the goal's door."""
         self._set_turn(quarters % QUARTERS)
-        self.phase, self._progress_stamp, self._before_door = Phase.DOOR, scan.stamp, False
+        self.phase, self._progress_stamp, self._before_door = Phase.DOOR, view.stamp, False
 
-    def _turn_at_node(self, scan: Scan) -> MotionCommand:
+    def _turn_at_node(self, view: ObstacleView) -> MotionCommand:
         """Turn at the last node into a hallway; if stuck, into another one."""
         frame = self.estimator.frame
         if frame.travel_axis % QUARTERS == self._target_axis % QUARTERS and not self.estimator.is_turning:
             self.phase, self._progress = Phase.HALLWAY, -math.inf
-        elif self._is_stuck(scan):
+        elif self._is_stuck(view):
             self._set_turn(self._freest_quarter(frame.travel_axis - self._target_axis))
-        return self._command_towards(scan, frame.node_line_point_in_base(self._target_axis, _LOOKAHEAD))
+        return self._command_towards(view, frame.node_line_point_in_base(self._target_axis, _LOOKAHEAD))
 
-    def _approach_door(self, scan: Scan) -> MotionCommand:
+    def _approach_door(self, view: ObstacleView) -> MotionCommand:
         """Turn to the goal's door, and start the metric filter there."""
         assert self._goal is not None
         frame = self.estimator.frame
@@ -310,48 +316,48 @@ class MissionController:
         aligned = abs(angle) <= _MAX_MISALIGNMENT
         start = metric_initial_pose(self.estimator, self._building.chart) if self._before_door and aligned else None
         if start is not None and start.node == self._goal.node:
-            return self._enter_room(start, scan)
-        if scan.stamp - self._progress_stamp > _DOOR_TIMEOUT:
+            return self._enter_room(start, view)
+        if view.stamp - self._progress_stamp > _DOOR_TIMEOUT:
             self._target_axis, self.phase, self._progress = self._hallway_axis, Phase.TURN, -math.inf
-            return self._turn_at_node(scan)
+            return self._turn_at_node(view)
         if not self._before_door:
-            return self._command_towards(scan, front)
-        return self._command_towards(scan, beyond) if aligned else turn_in_place(angle, self._limits)
+            return self._command_towards(view, front)
+        return self._command_towards(view, beyond) if aligned else turn_in_place(angle, self._limits)
 
-    def _enter_room(self, start: MetricInitialPose, scan: Scan) -> MotionCommand:
+    def _enter_room(self, start: MetricInitialPose, view: ObstacleView) -> MotionCommand:
         """Switch to the metric filter."""
         self.room = RoomFilter(self._mapping, self._building, start)
         self._entered_destination, self.initial_pose, self.phase = self._goal, start, Phase.ROOM
         self._path_follower = PathFollower(self._limits, _PLACE_TOLERANCE)
-        return self._drive_into_room(scan)
+        return self._drive_into_room(view)
 
-    def _drive_into_room(self, scan: Scan) -> MotionCommand:
+    def _drive_into_room(self, view: ObstacleView) -> MotionCommand:
         """Drive to the destination in the room."""
         goal = self._entered_destination
         assert goal is not None
         door = goal.opening.landmark.pose.mean
         through = se2.transform(door, np.array([[-_DOOR_MARGIN, 0.0], [_DOOR_MARGIN, 0.0]]))
-        command = self._follow_path(scan, np.concatenate((through, goal.position[None])))
+        command = self._follow_path(view, np.concatenate((through, goal.position[None])))
         if self._path_follower.has_arrived:
             self.phase = Phase.THERE
         return command
 
-    def _drive_out_of_room(self, scan: Scan) -> MotionCommand:
+    def _drive_out_of_room(self, view: ObstacleView) -> MotionCommand:
         """Drive back to the node before the door, and continue by the belief from there."""
         assert self._entered_destination is not None
         assert self.room is not None
         door = self._entered_destination.opening.landmark.pose.mean
         through = se2.transform(door, np.array([[_DOOR_MARGIN, 0.0], [-_DOOR_MARGIN, 0.0]]))
-        command = self._follow_path(scan, np.concatenate((self._entered_destination.position[None], through)))
+        command = self._follow_path(view, np.concatenate((self._entered_destination.position[None], through)))
         if self._path_follower.has_arrived:
-            self._resume_in_hallway(scan)
+            self._resume_in_hallway(view)
         return command
 
-    def _follow_path(self, scan: Scan, path: Float64) -> MotionCommand:
+    def _follow_path(self, view: ObstacleView, path: Float64) -> MotionCommand:
         assert self.room is not None
-        return self._path_follower.steer(scan, se2.transform(se2.inverse(self.room.pose), path), self._velocity)
+        return self._path_follower.steer(view, se2.transform(se2.inverse(self.room.pose), path), self._velocity)
 
-    def _resume_in_hallway(self, scan: Scan) -> None:
+    def _resume_in_hallway(self, view: ObstacleView) -> None:
         """Continue at the node before a room's door, with the direction of the metric filter.
 
         The goal is at another node, or behind another door of this one.
@@ -370,7 +376,7 @@ class MissionController:
         self._last_event = 0, False
         if self._goal.node == node:
             self._hallway_axis = self.estimator.frame.travel_axis - (opening.direction - direction) + 1
-            self._start_door_approach(self._goal.opening.direction - direction, scan)
+            self._start_door_approach(self._goal.opening.direction - direction, view)
             return
         quarters = turn_towards(graph, state, self._goal.node, self.edge_monitor.closed_states)
         self._set_turn(quarters or 0)

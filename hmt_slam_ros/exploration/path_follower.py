@@ -9,12 +9,12 @@ import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.configuration.robot import ExplorerParameters
+from hmt_slam_ros.exploration.laser_views import ObstacleView
 from hmt_slam_ros.exploration.local_motion import MotionCommand, MotionLimits, command_towards
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.sensors import Scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ class PathFollower:
         self._last_wait_progress, self._wait_end = -math.inf, 0
         self.remaining = math.inf
 
-    def steer(self, scan: Scan, path: Float64, velocity: tuple[float, float]) -> MotionCommand:
+    def steer(self, view: ObstacleView, path: Float64, velocity: tuple[float, float]) -> MotionCommand:
         """The velocities until the next scan.
 
         :param path: shape (n, 2), the same points at each call, in the frame of the base now, m.
@@ -135,16 +135,16 @@ class PathFollower:
         points = _interpolate(path, along, ahead)
         distances = np.hypot(*points.T)
         # The path may also pass on the other side of a wall.
-        nearest = int(np.argmin(np.where(_is_in_sight(scan, points), distances, distances + _PROGRESS_WINDOW)))
+        nearest = int(np.argmin(np.where(_is_in_sight(view, points), distances, distances + _PROGRESS_WINDOW)))
         self._progress = float(ahead[nearest])
         self.remaining = float(distances[nearest]) + end - self._progress
         if self.remaining < self._least_remaining - _MIN_PROGRESS:
-            self._least_remaining, self._progress_stamp = self.remaining, scan.stamp
-        goal = self._visible_goal(scan, path, along)
-        if goal is None and self._is_waiting(scan.stamp):
+            self._least_remaining, self._progress_stamp = self.remaining, view.stamp
+        goal = self._visible_goal(view, path, along)
+        if goal is None and self._is_waiting(view.stamp):
             return MotionCommand(0.0, 0.0, arrived=False)
         beyond = _interpolate(path, along, np.minimum(self._progress + np.array([_MAX_LOOKAHEAD]), end))[0]
-        return command_towards(scan, beyond if goal is None else goal, velocity, self._limits)
+        return command_towards(view, beyond if goal is None else goal, velocity, self._limits)
 
     def _is_waiting(self, stamp: int) -> bool:
         """Whether to wait before an obstacle: a person may stop, too, before a robot that moves."""
@@ -152,12 +152,12 @@ class PathFollower:
             self._last_wait_progress, self._wait_end = self._progress, stamp + _WAIT_TIME
         return stamp < self._wait_end
 
-    def _visible_goal(self, scan: Scan, path: Float64, along: Float64) -> Float64 | None:
+    def _visible_goal(self, view: ObstacleView, path: Float64, along: Float64) -> Float64 | None:
         """The farthest visible point ahead on the path that is clear of surfaces; None for none."""
         ahead = np.minimum(self._progress + np.arange(_MAX_LOOKAHEAD, _MIN_LOOKAHEAD, -_STEP), along[-1])
         points = _interpolate(path, along, ahead)
-        free = np.hypot(*(points[:, None] - scan.points[None]).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
-        suitable = _is_in_sight(scan, points) & (free > self._limits.radius + self._limits.margin + _STEP)
+        free = np.hypot(*(points[:, None] - view.points[None]).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
+        suitable = _is_in_sight(view, points) & (free > self._limits.radius + self._limits.margin + _STEP)
         return points[int(np.argmax(suitable))] if suitable.any() else None
 
     @property
@@ -179,11 +179,11 @@ def _interpolate(path: Float64, along: Float64, distances: Float64) -> Float64:
     return np.stack([np.interp(distances, along, path[:, axis]) for axis in (0, 1)], axis=1)
 
 
-def _is_in_sight(scan: Scan, points: Float64) -> Bool:
+def _is_in_sight(view: ObstacleView, points: Float64) -> Bool:
     """Whether points (k, 2) are visible to the robot, shape (k,)."""
     distances = np.maximum(np.hypot(*points.T), 1e-9)
     directions = points / distances[:, None]
-    along = directions @ scan.points.T
-    beside = directions @ np.stack((-scan.points[:, 1], scan.points[:, 0]))
+    along = directions @ view.points.T
+    beside = directions @ np.stack((-view.points[:, 1], view.points[:, 0]))
     hiding = (along > 0.0) & (along < distances[:, None]) & (np.abs(beside) <= 0.5 * _STEP)
     return np.asarray(~hiding.any(axis=1))

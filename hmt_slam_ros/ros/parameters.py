@@ -149,7 +149,7 @@ def declare_frame(node: Node, which: str, default: str, note: str = "") -> str:
 def declare_laser_poses(node: Node, topics: Sequence[str]) -> dict[str, NDArray[np.float64]]:
     """Declare ``laser_pose``, and return {topic: ``base_T_laser`` (3,)}, empty where it is.
 
-    :param topics: those of the scans; a node that has the first alone takes the first pose.
+    :param topics: those of the scans.
     :raises HmtSlamError: for anything but three finite numbers for each topic.
     """
     value = _declare_numbers(

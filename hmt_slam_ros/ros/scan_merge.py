@@ -40,12 +40,19 @@ class ScanMerge:
         """Number of scans that wait for those of other topics."""
         return len(self._waiting)
 
+    @property
+    def silent_topics(self) -> list[str]:
+        """The topics that are not waited for, since nothing came on them yet, or nothing for half a second."""
+        newest = max(self._newest.values(), default=0)
+        return [t for t in self._topics if (own := self._newest.get(t)) is None or newest - own > _LONGEST_LAG]
+
     def push(self, topic: str, scan: Scan) -> list[Scan] | None:
         """The scans that pass now, in order; None where this one came too late.
 
         :param scan: stamped after the last one of its topic, unless time went back.
         """
         if len(self._topics) == 1:
+            self._newest[topic] = scan.stamp
             return [scan]
         due: list[Scan] = []
         if scan.stamp <= self._newest.get(topic, scan.stamp - 1):  # time went back
@@ -61,11 +68,8 @@ class ScanMerge:
 
     def _is_due(self, stamp: int) -> bool:
         """Whether no topic that is not silent may still send an earlier scan."""
-        newest = max(self._newest.values())
-        return all(
-            (own := self._newest.get(topic)) is None or own >= stamp or newest - own > _LONGEST_LAG
-            for topic in self._topics
-        )
+        silent = self.silent_topics
+        return all(topic in silent or self._newest[topic] >= stamp for topic in self._topics)
 
     def _pass_on(self, scan: Scan) -> Scan:
         """A scan that passes; of two that were taken at one time, the stamp of the second is the next one."""

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import Odometry as OdometryMessage
-from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
@@ -37,13 +36,14 @@ from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.execution import spin_until
 from hmt_slam_ros.ros.initial_state import InitialState, declare_start_from
-from hmt_slam_ros.ros.laser_mountings import LaserMountings, check_scan_message
+from hmt_slam_ros.ros.laser_mountings import LaserMountings
 from hmt_slam_ros.ros.map_publisher import MapPublisher
 from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
 from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, OdometryFrames, declare_odometry_frame
 from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_poses
 from hmt_slam_ros.ros.room_markers import RoomMarkers
 from hmt_slam_ros.ros.task_interface import TaskHost, TaskInterface, TaskProcess
+from hmt_slam_ros.ros.task_scans import TaskScans
 from hmt_slam_ros.ros.topics import (
     CMD_VEL,
     GOAL_POSE,
@@ -52,9 +52,8 @@ from hmt_slam_ros.ros.topics import (
     ODOM,
     PLACE,
     ROOMS,
-    SCAN,
 )
-from hmt_slam_ros.sensors import Odometry
+from hmt_slam_ros.sensors import Odometry, Scan
 from hmt_slam_ros.untrusted_input import shorten
 
 if TYPE_CHECKING:
@@ -65,8 +64,6 @@ _FIRST_AREA_POSE = AreaPose(FIRST_AREA, PoseGaussian.from_pose(np.zeros(3)))
 """Pose of the first area, whose frame is the map's; known before the first closure decision."""
 _MAX_GAP_CHECKS = 2
 """Further checks, once a second, that find the same gap in the chain before the node ends."""
-_MISSING_TRANSFORMS = 20
-"""Scans without a transform after which that is reported."""
 _ROOMS_PERIOD = 0.9
 """Least time between two messages of rooms, s; just below whole checks."""
 
@@ -88,10 +85,9 @@ class TaskNode(TaskHost):
         super().__init__(name)
 
     def declare_own_parameters(self) -> None:
-        """Declare frames, the laser's pose and ``start_from``."""
+        """Declare frames, the lasers' poses and ``start_from``."""
         self.map_frame, self._base_frame = declare_frame(self, "map", "map"), declare_odometry_frame(self, BASE_FRAME)
-        poses = list(declare_laser_poses(self, self.configuration.sensors.topics).values())
-        self._laser_poses = dict.fromkeys((SCAN,), poses[0]) if poses else {}
+        self._laser_poses = declare_laser_poses(self, self.configuration.sensors.topics)
         self._start_from = declare_start_from(self)
 
     def spin(self) -> None:
@@ -111,7 +107,7 @@ class TaskNode(TaskHost):
 
         :raises HmtSlamError: for a map that is damaged or does not match.
         """
-        self._reset_number, self._scans_without_mounting = 0, 0
+        self._reset_number = 0
         self._last_gap: str | None = None
         self._gap_checks = 0
         initial_state = InitialState(self, self._start_from, lost=True)
@@ -121,11 +117,10 @@ class TaskNode(TaskHost):
         self.tasks = TaskInterface(self, self._name, self._process)
         self._goals = self.create_publisher(PoseStamped, GOAL_POSE, topics.STREAM)
         frames = OdometryFrames(self.diagnostics, base_frame=self._base_frame)
-        self._mountings = LaserMountings(self, self.diagnostics, frames, self._laser_poses)
         if Odometry not in SUBSCRIPTIONS[self._name]:
             self.create_subscription(OdometryMessage, ODOM, frames.note, topics.NEWEST)
         self.create_subscription(PoseWithCovarianceStamped, HMT_POSE, self._on_pose, topics.NEWEST)
-        self.create_subscription(LaserScan, SCAN, self._on_scan, topics.NEWEST)
+        TaskScans(self, LaserMountings(self, self.diagnostics, frames, self._laser_poses), self._process_scan)
         self._inbox = Inbox(
             self,
             SUBSCRIPTIONS[self._name],
@@ -212,22 +207,9 @@ class TaskNode(TaskHost):
         )
         self.process_message(self._robot_pose)
 
-    def _on_scan(self, message: LaserScan) -> None:
-        if not self.is_active:
-            return
-        try:
-            scan = self._mountings.convert_scan(check_scan_message(message), SCAN)
-        except HmtSlamError as fault:
-            self.diagnostics.refuse(SCAN, fault)
-            return
-        self.diagnostics.received["Scan"] += 1
-        if scan is not None:
-            self.tasks.stamp = scan.stamp
-            self.process_message(scan)
-            return
-        self._scans_without_mounting += 1
-        if self._scans_without_mounting == _MISSING_TRANSFORMS:
-            self.diagnostics.warn(self._mountings.missing_transform_text(message, self._scans_without_mounting))
+    def _process_scan(self, scan: Scan) -> None:
+        self.tasks.stamp = scan.stamp
+        self.process_message(scan)
 
     def _on_reset_request(self, request: ResetRequest) -> None:
         """Start again with the same map as the processes; a task ends with its map."""

@@ -62,6 +62,8 @@ class DrivenRobot:
         for name in _SCRIPTED_ONLY:
             if getattr(settings, name):
                 raise HmtSlamError(f"a robot that is driven by commands has no setting {name}: set {name}=0")
+        if settings.lasers > 1 and settings.readings == 1:
+            raise HmtSlamError("a robot that is driven by commands has one laser with readings=1: set readings=2")
         self.scenario = scenario
         self.pose = np.array(scenario.poses[0] if start is None else start, dtype=np.float64)
         self.velocity = (0.0, 0.0)
@@ -116,13 +118,14 @@ class DrivenRobot:
         self._update_odometry()
 
     def measure(self) -> tuple[Odometry, Scan | None]:
-        """Odometry now, with a scan at every ``settings.readings``-th reading."""
-        settings, stamp = self.scenario.settings, self.stamp
-        number, between = divmod(self._reading, settings.readings)
+        """Odometry now, with a scan at every ``settings.readings``-th reading; of a second laser halfway between."""
+        scenario, stamp = self.scenario, self.stamp
+        number, between = divmod(self._reading, scenario.settings.readings)
         reading = Odometry(stamp, self._odometry)
-        if between:
+        is_rear = between == scenario.settings.readings // 2 and between > 0
+        laser = scenario.rear_laser if is_rear else scenario.laser
+        if laser is None or (between and not is_rear):
             return reading, None
-        laser = self.scenario.laser
         distances = laser.distances(self.pose[None], self.scenario.surfaces, self.people_discs)
         return reading, laser.scan(number, stamp, distances)
 
