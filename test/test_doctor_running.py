@@ -11,7 +11,7 @@ def test_nodes_that_compile_their_kernels_are_no_fault_of_a_running_system():
     text = "compiling kernels, 40 s left"
     statuses = tuple(NodeStatus(f"/{name}", 0, text, "inactive") for name in process_names())
     topics = defaultdict(lambda: Topic(1, ("driver",)))
-    running = RunningSystem(1.0, topics, process_names(), (), statuses, {}, {}, "")
+    running = RunningSystem(1.0, topics, process_names(), (), statuses, {}, {})
     findings = list(running_findings(running))
     assert {finding.severity for finding in findings} <= {"fine"}
     assert any(f"/slam: {text}; " in finding.text for finding in findings)
@@ -25,7 +25,7 @@ def test_nodes_that_compile_their_kernels_are_no_fault_of_a_running_system():
 
 def test_nodes_without_a_system_that_run_twice_are_named():
     topics = defaultdict(lambda: Topic(1, ("driver",)))
-    running = RunningSystem(1.0, topics, (*process_names(), "rtl"), (), (), {}, {}, "")
+    running = RunningSystem(1.0, topics, (*process_names(), "rtl"), (), (), {}, {})
     findings = [finding for finding in running_findings(running) if finding.severity == "wrong"]
     assert [(finding.subject, finding.text) for finding in findings] == [
         (

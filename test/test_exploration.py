@@ -331,6 +331,16 @@ def test_it_stands_where_nothing_tells_the_pose_any_more() -> None:
     assert lost == VelocityCommand(own.robot.stamp + 2 * NANOSECONDS, 0.0, 0.0)
 
 
+def test_two_lasers_that_see_half_each_lead_it_as_one_all_around_does() -> None:
+    """They are before and behind the middle of the robot, whose ground neither sees at first."""
+    settings = Settings(seed=6, laps=1, field_of_view=180.0, beams=181, lasers=2, forward=0.2)
+    robot, configuration = DrivenRobot(Scenario(small_floor(), settings)), Configuration()
+    run = DrivenRun(robot, configuration, Explorer(configuration))
+    assert run.run_task(Task("explore"), 15.0) is None
+    assert robot.contacts == 0
+    assert robot.distance_traveled > 6.0
+
+
 def test_same_seed_same_path_bit_for_bit() -> None:
     one, other = path_of(explore()), path_of(explore(1))
     known = min(explore(number).length for number in (0, 1))

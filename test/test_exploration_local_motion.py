@@ -136,3 +136,48 @@ def test_it_passes_doors_of_ninety_centimeters(laser):
     legs = list(drive_goals(scenario_of("doors", 4, laser), 8))
     assert all(leg.reached for leg in legs)
     assert sum(leg.contacts for leg in legs) == 0
+
+
+def half_scan(points, theta, stamp=0, x=0.0):
+    """What a laser with half a field of view at (x, 0, theta) sees of points (n, 2) in the robot's frame."""
+    laser, ranges = np.array([x, 0.0, theta]), np.full(181, np.inf, dtype=np.float32)
+    for along, left in se2.transform(se2.inverse(laser), np.asarray(points)):
+        beam = round(math.degrees(math.atan2(left, along))) + 90
+        if 0 <= beam <= 180:
+            ranges[beam] = math.hypot(along, left)
+    return Scan(stamp, ranges, -0.5 * math.pi, math.pi / 180.0, 0.02, 20.0, laser)
+
+
+def test_it_brakes_for_what_another_laser_than_that_of_the_last_scan_sees():
+    posts, views = np.array([[1.0, 0.0], [-2.0, 0.0]]), LaserViews()
+    views.add(half_scan(posts, 0.0, x=0.2))
+    # It drives on by half a meter, and the laser behind scans.
+    views.move(np.array([0.5, 0.0, 0.0]))
+    rear = half_scan(posts - (0.5, 0.0), math.pi, 50_000_000, x=-0.2)
+    view = views.add(rear)
+    np.testing.assert_allclose(view.points, [[0.5, 0.0], [-2.5, 0.0]], atol=0.01)
+    assert (view.stamp, view.field) == (50_000_000, math.pi)
+    assert command_towards(view, np.array([3.0, 0.0]), (0.4, 0.0), LIMITS).speed < 0.4
+    assert command_towards(LaserViews().add(rear), np.array([3.0, 0.0]), (0.4, 0.0), LIMITS).speed > 0.4
+
+
+def test_what_a_laser_saw_long_ago_is_no_obstacle():
+    views = LaserViews()
+    views.add(half_scan([[1.0, 0.0]], 0.0))
+    view = views.add(half_scan([[-1.0, 0.0]], math.pi, 1_500_000_000))
+    np.testing.assert_allclose(view.points, [[-1.0, 0.0]], atol=1e-6)
+    assert view.field < 0.1
+
+
+@pytest.mark.parametrize(("angles", "field"), [([0.0], 0.5), ([0.0, 1.0], 1.0 / 3.0), ([0.0, 0.5, -0.5], 1.0)])
+def test_the_field_of_view_of_lasers_together(angles, field):
+    """In half turns, to both sides of the robot alike; two lasers that leave a gap at a side see as far as there."""
+    beams = {0.5: 181, 1.0 / 3.0: 121, 1.0: 181}[field]
+    first = -math.radians(0.5 * (beams - 1))
+    views = LaserViews()
+    for angle in angles:
+        scan = Scan(
+            0, np.ones(beams, np.float32), first, math.pi / 180.0, 0.02, 20.0, np.array([0, 0, math.pi * angle])
+        )
+        view = views.add(scan)
+    assert view.field == pytest.approx(math.pi * field, abs=math.radians(1.1))

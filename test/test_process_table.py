@@ -58,7 +58,7 @@ def examine_without_it():
 
     others = tuple(name for name in process_names() if name != NAME)
     topics = defaultdict(lambda: Topic(1, ("driver",)))
-    texts = [finding.text for finding in running_findings(RunningSystem(1.0, topics, others, (), (), {}, {}, ""))]
+    texts = [finding.text for finding in running_findings(RunningSystem(1.0, topics, others, (), (), {}, {}))]
     assert any(f"Of the nodes, {NAME} is missing" in text for text in texts), texts
 
 

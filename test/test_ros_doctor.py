@@ -1,6 +1,9 @@
 """hmt_slam doctor --live, as a process of its own, over real DDS."""
 
+import itertools
 import json
+import math
+import re
 import subprocess
 import time
 
@@ -90,6 +93,42 @@ def test_what_is_silent_missing_or_does_not_fit_is_reported(listener, doctor):
     ):
         assert any(text.startswith(begin) for text in wrong), (begin, wrong)
     assert len(wrong) == 6, wrong
+
+
+def test_all_lasers_that_slam_has_are_examined_and_compared(listener, doctor):
+    """The mounting of the second one is stated 8 degrees off; of a third one nothing comes."""
+    stated = [0.2, 0.0, 0.0, -0.2, 0.0, math.pi - math.radians(8.0), 0.0, 0.0, 0.0]
+    parameters = {"sensors.scan_topics": "front,rear,left", "laser_pose": stated}
+    slam = Node(
+        "slam",
+        context=listener.context,
+        parameter_overrides=[Parameter(name, value=value) for name, value in parameters.items()],
+        automatically_declare_parameters_from_overrides=True,
+    )
+    readings = listener.node.create_publisher(OdometryMessage, "odom", 100)
+    publishers = [listener.node.create_publisher(LaserScan, topic, 100) for topic in ("front", "rear")]
+    records = iter(list(open_log(f"{WORLD},lasers=2,forward=0.2", duration=70.0).records()))
+
+    def publish():
+        is_heard = all(publisher.get_subscription_count() for publisher in (readings, *publishers))
+        for record in itertools.islice(records, 10 if is_heard else 0):
+            measurement = record.measurement
+            if isinstance(measurement, Scan):
+                is_rear = measurement.laser_pose[0] < 0.0
+                publishers[int(is_rear)].publish(conversions.scan_message(measurement, f"laser_{int(is_rear)}"))
+            else:
+                readings.publish(conversions.odometry_message(measurement, "odom", "base_link"))
+
+    listener.executor.add_node(slam)
+    _, findings = doctor(4.0, meanwhile=publish)
+    listener.executor.remove_node(slam)
+    slam.destroy_node()
+    wrong = texts(findings, "wrong")
+    assert any(text.startswith("left silent: Nobody publishes left: ") for text in wrong), wrong
+    assert not any(text.startswith(("front silent", "rear silent", "scan silent", "laser transform")) for text in wrong)
+    (compared,) = [text for text in texts(findings, "wrong", "doubtful") if text.startswith("two lasers: ")]
+    assert "The laser at (-0.20 m, 0.00 m, 172 degrees)" in compared
+    assert float(re.search(r"([0-9.]+) degrees apart", compared).group(1)) == pytest.approx(8.0, abs=1.0)
 
 
 def test_frames_that_contradict_and_two_systems_are_reported(listener, doctor):

@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Header, String
@@ -19,7 +20,7 @@ from hmt_slam_ros.messages.tasks import TaskFeedback
 from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import keyframe_frame, pose_from_message, pose_message
-from hmt_slam_ros.ros.topics import KEYFRAME_SCANS, KEYFRAMES, ROOMS, TASK_FEEDBACK
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, KEYFRAME_SCANS, KEYFRAMES, ROOMS, TASK_FEEDBACK
 
 WORLD = """
 walls: [[0, -1, 5, -1], [5, -1, 5, 1], [5, 1, 3, 1], [3, 1, 3, 4],
@@ -31,6 +32,24 @@ settings: {field_of_view: 360.0, beams: 360, laps: 1, people: 0}
 
 PROCESSES = process_names()
 
+REAR_ANGLE = 0.5
+"""Heading of the second laser, rad, which sees what the first one sees."""
+
+
+class SecondLaser:
+    """Sends each scan again as that of a second laser, as soon as it is switched on."""
+
+    def __init__(self, listener):
+        self.is_on = False
+        self._scans = listener.node.create_publisher(LaserScan, "scan_rear", 10)
+        listener.node.create_subscription(LaserScan, "scan", self._on_scan, 10)
+
+    def _on_scan(self, scan):
+        if self.is_on:
+            scan.angle_min -= REAR_ANGLE
+            scan.angle_max -= REAR_ANGLE
+            self._scans.publish(scan)
+
 
 @pytest.fixture
 def system(tmp_path, start, listener):
@@ -40,7 +59,7 @@ def system(tmp_path, start, listener):
 
     def start_all(**parameters):
         nodes = [start(name) for name in PROCESSES]
-        explorer = start("explorer", laser_pose="[0.0,0.0,0.0]", **parameters)
+        explorer = start("explorer", **{"laser_pose": "[0.0,0.0,0.0]", **parameters})
         listener.until(lambda: listener.node.count_publishers("goal_pose"))
         robot = start(
             "robot",
@@ -56,13 +75,20 @@ def system(tmp_path, start, listener):
 
 
 def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listener, system, start):
-    """It also restarts where it was not there when the map was exchanged. Without a task there is none to cancel."""
+    """It also restarts where it was not there when the map was exchanged. Without a task there is none to cancel.
+
+    It has two lasers, and stands while one of them is silent.
+    """
     outcomes = listener.subscribe(String, "explorer/task_result", topics.LATCHED)
     rooms = listener.subscribe(MarkerArray, ROOMS["explorer"], topics.LATCHED)
     goals = listener.subscribe(PoseStamped, "goal_pose", topics.STREAM)
     truths = listener.subscribe(PoseStamped, "ground_truth", topics.STREAM)
     feedback = listener.subscribe(String, TASK_FEEDBACK, topics.STREAM)
-    nodes = system()
+    reports = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
+    second = SecondLaser(listener)
+    nodes = system(sensors__scan_topics="scan,scan_rear", laser_pose=f"[0.0,0.0,0.0,0.0,0.0,{REAR_ANGLE}]")
+    assert_stands_beside_a_silent_laser(listener, nodes, reports, truths)
+    second.is_on = True
     listener.until(lambda: outcomes, alive=nodes)
     reported = [decode(message.data, TaskFeedback) for message in feedback]
     assert {each.task for each in reported} == {"explore"}
@@ -115,6 +141,12 @@ def assert_room_is_the_arm(message):
     assert 0.0 < marker.pose.position.x < 2.0  # from where the robot began, at (1, 0)
     assert 1.0 < marker.pose.position.y < 4.0
     assert marker.header.frame_id == "map"
+
+
+def assert_stands_beside_a_silent_laser(listener, nodes, reports, truths):
+    silence = "scans come on scan, and none on scan_rear, so that the robot stands"
+    listener.until(lambda: any(silence in one.status[0].message for one in reports), alive=nodes)
+    assert np.ptp([pose_from_message(message.pose) for message in truths], axis=0).max() < 1e-9
 
 
 @pytest.mark.long

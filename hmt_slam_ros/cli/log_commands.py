@@ -7,10 +7,12 @@ import json
 from collections.abc import Sequence
 
 from hmt_slam_ros.cli.terminal import report_left_out
+from hmt_slam_ros.configuration.metric_slam import split_topics
 from hmt_slam_ros.doctor.examination import examine
 from hmt_slam_ros.doctor.finding import SEVERITIES, Finding
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.evaluation import read_true_poses, write_tum
+from hmt_slam_ros.logs.bag import DEFAULT_SCAN_TOPIC
 from hmt_slam_ros.logs.records import SIMULATION_PREFIX
 from hmt_slam_ros.logs.writer import write_bag
 from hmt_slam_ros.open_log import open_log
@@ -60,7 +62,8 @@ def _examine_running_system(options: argparse.Namespace) -> list[Finding]:
         from hmt_slam_ros.ros.doctor_node import examine_running  # noqa: PLC0415  it needs ROS
     except ImportError as fault:
         raise HmtSlamError(f"doctor --live needs ROS ({fault}): source Jazzy or install its wheels") from fault
-    return examine_running(options.seconds, options.ros_arguments)
+    topics = () if options.scans == DEFAULT_SCAN_TOPIC else split_topics(options.scans)
+    return examine_running(options.seconds, options.ros_arguments, topics)
 
 
 def _as_json(findings: Sequence[Finding]) -> str:

@@ -19,8 +19,8 @@ _ROBOT = "robot"
 
 SCAN, ODOM, TF, TF_STATIC, CLOCK = "scan", "odom", "tf", "tf_static", "/clock"
 ESTIMATES = topic_of("LocalEstimate")
-SINGLE_PUBLISHER_TOPICS = (SCAN, ODOM, "map", "pose", CLOCK)
-"""Topics that have one publisher."""
+SINGLE_PUBLISHER_TOPICS = (ODOM, "map", "pose", CLOCK)
+"""Topics that have one publisher, as those of scans."""
 
 _STATE_REMEDIES = {
     "unconfigured": "ros2 lifecycle set {first} configure and then activate{others}, or start with autostart:=true",
@@ -103,10 +103,11 @@ class RunningSystem:
     :ivar clock_offsets: {topic: median by which its stamps precede the computer's clock on arrival, s}; empty where
         /clock is published.
     :ivar conflicting_transforms: {transform: number of stamps for which two sources published different values}.
-    :ivar missing_laser_transform: sentence about a missing transform of the laser, empty where none is missing.
+    :ivar missing_laser_transforms: a sentence about each missing transform of a laser.
     :ivar other_namespaces: other namespaces with nodes of ours.
     :ivar frame_contradictions: parameters of nodes that name other frames than the odometry.
     :ivar systems: names of the systems of our nodes in the doctor's namespace.
+    :ivar scan_topics: topics of the scans.
     """
 
     seconds: float
@@ -116,10 +117,16 @@ class RunningSystem:
     diagnostics: tuple[NodeStatus, ...]
     clock_offsets: Mapping[str, float]
     conflicting_transforms: Mapping[str, int]
-    missing_laser_transform: str
+    missing_laser_transforms: tuple[str, ...] = ()
     other_namespaces: tuple[str, ...] = ()
     frame_contradictions: tuple[FrameContradiction, ...] = ()
     systems: tuple[str, ...] = ()
+    scan_topics: tuple[str, ...] = (SCAN,)
+
+    @property
+    def has_scans(self) -> bool:
+        """Whether scans came on any topic."""
+        return any(self.topics[name].message_count for name in self.scan_topics)
 
 
 def running_findings(running: RunningSystem) -> Iterator[Finding]:
@@ -206,7 +213,7 @@ def _is_compiling(status: NodeStatus) -> bool:
 
 
 def _check_silence(running: RunningSystem, *, all_active: bool) -> Iterator[Finding]:
-    for name in (SCAN, ODOM):
+    for name in (*running.scan_topics, ODOM):
         topic = running.topics[name]
         by_transform = name == ODOM and running.topics[TF].message_count
         if topic.message_count or by_transform:
@@ -215,15 +222,10 @@ def _check_silence(running: RunningSystem, *, all_active: bool) -> Iterator[Find
             yield Finding("fine", f"{name} silent", f"{_ROBOT} sends nothing on {name} until the kernels are compiled.")
         else:
             yield Finding("wrong", f"{name} silent", _silence_text(name, topic, running.seconds))
-    if running.missing_laser_transform:
-        yield Finding("wrong", "laser transform", running.missing_laser_transform)
+    for text in running.missing_laser_transforms:
+        yield Finding("wrong", "laser transform", text)
     estimates = running.topics[ESTIMATES]
-    if (
-        COORDINATOR in running.nodes
-        and running.topics[SCAN].message_count
-        and not estimates.message_count
-        and all_active
-    ):
+    if COORDINATOR in running.nodes and running.has_scans and not estimates.message_count and all_active:
         text = (
             f"Scans arrive, but slam sent no estimate for {running.seconds:g} s: it is paused, or waits for odometry, "
             "a transform or the other nodes; its own log and /diagnostics say for which."
@@ -254,7 +256,7 @@ def _check_qos(running: RunningSystem) -> Iterator[Finding]:
 
 
 def _check_publishers(running: RunningSystem) -> Iterator[Finding]:
-    for name in SINGLE_PUBLISHER_TOPICS:
+    for name in (*running.scan_topics, *SINGLE_PUBLISHER_TOPICS):
         topic = running.topics.get(name)
         if topic is not None and len(topic.publishers) > 1:
             text = (

@@ -14,6 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from hmt_slam_ros.arrays import Bool, Float64, Int64
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.grids.occupancy_map import OCCUPIED, UNKNOWN, occupancy_image
 from hmt_slam_ros.sensors import Scan
 
@@ -73,9 +74,12 @@ class NavigationGrid:
         self.origin, self._min_clearance = image.origin, min_clearance
         # Single unknown cells between two beams are closed.
         known = ndimage.binary_closing(pixels != UNKNOWN, _NEIGHBORS)
+        self.free: Bool = known
+        # No laser sees the ground between it and the robot's middle.
+        known |= self._cells_on_lines(_lines_to_lasers(scans, poses))
         self.unknown: Bool = ~known
         self.clearance: Float64 = _CELL * ndimage.distance_transform_edt(pixels != OCCUPIED)
-        self.free: Bool = known & (pixels != OCCUPIED) & (self.clearance >= min_clearance)
+        self.free = known & (pixels != OCCUPIED) & (self.clearance >= min_clearance)
         rows, columns = self.cells(poses[:, :2]).T
         passable = self.free.copy()
         passable[rows, columns] = True
@@ -176,3 +180,11 @@ class NavigationGrid:
         count = int(passable.sum())
         both_ways = (np.concatenate((first, second)), np.concatenate((second, first)))
         return coo_array((np.concatenate((cost, cost)), both_ways), shape=(count, count)).tocsr()
+
+
+def _lines_to_lasers(scans: Sequence[Scan], poses: Float64) -> Float64:
+    """The lines from keyframes to their lasers, (n, 4), x and y of both ends, m; of lasers amid the robot none."""
+    mountings = np.array([scan.laser_pose for scan in scans]).reshape(-1, 3)
+    is_aside = mountings[:, :2].any(axis=1)
+    lasers = se2.compose(poses[is_aside], mountings[is_aside])
+    return np.concatenate((poses[is_aside, :2], lasers[:, :2]), axis=1)

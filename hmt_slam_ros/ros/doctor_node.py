@@ -6,9 +6,10 @@ import heapq
 import os
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,10 +24,12 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.subscription import Subscription
 from rclpy.task import Future
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
+from hmt_slam_ros.configuration.metric_slam import split_topics
 from hmt_slam_ros.doctor import running
 from hmt_slam_ros.doctor.examination import gathered_findings
 from hmt_slam_ros.doctor.finding import Finding, sorted_findings
@@ -37,7 +40,7 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.logs.mounting import FrameTree, Mounting, frame_name, planar_mounting
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import running_stamps
-from hmt_slam_ros.process_table import producer, topic_of
+from hmt_slam_ros.process_table import COORDINATOR, producer, topic_of
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, STATE, SYSTEM, is_of_other_namespace
 from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, ODOM_FRAME
@@ -51,22 +54,24 @@ _DISCOVERY_TIMEOUT = 5.0
 """Time in which DDS finds the first other node, s."""
 _SPIN = 0.05  # s
 _USE_SIM_TIME, _LASER_POSE = "use_sim_time", "laser_pose"
-_PARAMETERS = (_USE_SIM_TIME, _LASER_POSE, ODOM_FRAME, BASE_FRAME)
+_SCAN_TOPICS = "sensors.scan_topics"
+_PARAMETERS = (_USE_SIM_TIME, _LASER_POSE, _SCAN_TOPICS, ODOM_FRAME, BASE_FRAME)
 _GRAPH_ONLY_TOPICS = ("map", "pose", *map(topic_of, ("KeyframeHeader", "Hypotheses", "ClosureDecision")))
 _ODOM_FRAME, _BASE_FRAME = "odom", "base_link"
 _MAP_TO_ODOM_NODE = producer("RealTimePose")
 
 
-def examine_running(seconds: float, ros_arguments: Sequence[str]) -> list[Finding]:
+def examine_running(seconds: float, ros_arguments: Sequence[str], scan_topics: Sequence[str] = ()) -> list[Finding]:
     """Findings about the running system, the most severe first.
 
     :param seconds: time to listen.
+    :param scan_topics: topics of the scans; those of slam if empty, or ``scan`` without slam.
     :param ros_arguments: those after ``--ros-args``.
     :raises HmtSlamError: for an invalid time, or arguments that ROS refuses.
     """
     if not 0.0 < seconds < float("inf"):
         raise HmtSlamError(f"--seconds {seconds:g} is no time to listen: give more than 0")
-    with _make_node(ros_arguments) as (node, executor):
+    with _make_node(ros_arguments, scan_topics) as (node, executor):
         begin = time.monotonic()
         while not node.other_nodes and time.monotonic() < begin + _DISCOVERY_TIMEOUT:
             executor.spin_once(timeout_sec=_SPIN)
@@ -74,15 +79,18 @@ def examine_running(seconds: float, ros_arguments: Sequence[str]) -> list[Findin
         while time.monotonic() < begin + seconds:
             executor.spin_once(timeout_sec=_SPIN)
             node.request_parameters()
+            node.follow_scan_topics()
         return sorted_findings(node.findings(seconds))
 
 
 @contextmanager
-def _make_node(ros_arguments: Sequence[str]) -> Iterator[tuple[DoctorNode, SingleThreadedExecutor]]:
+def _make_node(
+    ros_arguments: Sequence[str], scan_topics: Sequence[str]
+) -> Iterator[tuple[DoctorNode, SingleThreadedExecutor]]:
     context = Context()
     try:
         rclpy.init(args=["--ros-args", *ros_arguments], context=context)
-        node = DoctorNode(context)
+        node = DoctorNode(context, scan_topics)
     except _ARGUMENT_ERRORS as fault:
         raise HmtSlamError(f"--ros-args {' '.join(ros_arguments)} cannot be ({fault}): see ros2 run --help") from fault
     executor = SingleThreadedExecutor(context=context)
@@ -100,9 +108,12 @@ def _make_node(ros_arguments: Sequence[str]) -> Iterator[tuple[DoctorNode, Singl
 class DoctorNode(Node):
     """Collects sensor messages, transforms, diagnostics and the ROS graph."""
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, scan_topics: Sequence[str] = ()) -> None:
+        """:param scan_topics: topics of the scans; those of slam if empty."""
         super().__init__(f"doctor_{os.getpid()}", context=context, enable_rosout=False)
-        self._scans: list[LaserScan] = []
+        self._given_topics = tuple(scan_topics)
+        self._scans: dict[str, list[LaserScan]] = {}
+        self._scan_subscriptions: dict[str, Subscription] = {}
         self._readings: list[Odometry] = []
         self._odometry_frames = ("", "")
         self._transform_odometry: dict[str, list[Odometry]] = defaultdict(list)
@@ -115,7 +126,7 @@ class DoctorNode(Node):
         self._systems: set[str] = set()
         self._parameter_clients: dict[str, Client] = {}
         self._parameter_futures: dict[str, dict[str, Future]] = {}
-        self.create_subscription(LaserScan, running.SCAN, self._on_scan, _BEST_EFFORT)
+        self.follow_scan_topics()
         self.create_subscription(OdometryMessage, running.ODOM, self._on_odometry, _BEST_EFFORT)
         self.create_subscription(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, _BEST_EFFORT)
         self.create_subscription(String, running.ESTIMATES, self._on_estimate, _BEST_EFFORT)
@@ -151,17 +162,31 @@ class DoctorNode(Node):
                     name: client.call_async(GetParameters.Request(names=[name])) for name in _PARAMETERS
                 }
 
+    def follow_scan_topics(self) -> None:
+        """Subscribe to the topics of the scans, which slam may name only now."""
+        wanted = self._given_topics or split_topics(self._slam_parameter(_SCAN_TOPICS).string_value) or (running.SCAN,)
+        if wanted == tuple(self._scan_subscriptions):
+            return
+        for topic in self._scan_subscriptions.keys() - set(wanted):
+            self.destroy_subscription(self._scan_subscriptions.pop(topic))
+        old = self._scan_subscriptions
+        self._scan_subscriptions = {topic: old.get(topic) or self._subscribe_to_scans(topic) for topic in wanted}
+        self._scans = {topic: self._scans.get(topic, []) for topic in wanted}
+
+    def _subscribe_to_scans(self, topic: str) -> Subscription:
+        return self.create_subscription(LaserScan, topic, partial(self._on_scan, topic), _BEST_EFFORT)
+
     def findings(self, seconds: float) -> list[Finding]:
         """Findings about the system, and about its measurements where there are scans."""
         system = self._running_system(seconds)
         found = list(running.running_findings(system))
-        if not system.topics[running.SCAN].message_count:
+        if not system.has_scans:
             return found
         return [*found, *gathered_findings(self._gather(), "the running system", self._message_statistics())]
 
-    def _on_scan(self, message: LaserScan) -> None:
-        self._count_message(running.SCAN, conversions.stamp_from_time(message.header.stamp))
-        self._scans.append(message)
+    def _on_scan(self, topic: str, message: LaserScan) -> None:
+        self._count_message(topic, conversions.stamp_from_time(message.header.stamp))
+        self._scans[topic].append(message)
 
     def _on_odometry(self, message: OdometryMessage) -> None:
         self._count_message(running.ODOM, conversions.stamp_from_time(message.header.stamp))
@@ -212,7 +237,7 @@ class DoctorNode(Node):
                 self._transform_odometry[child].append(Odometry(stamp, pose))
 
     def _running_system(self, seconds: float) -> RunningSystem:
-        names = (running.SCAN, running.ODOM, running.TF, running.TF_STATIC, running.CLOCK, running.ESTIMATES)
+        names = (*self._scans, running.ODOM, running.TF, running.TF_STATIC, running.CLOCK, running.ESTIMATES)
         topics = {name: self._topic(name, self._counts[name]) for name in names}
         topics |= {name: self._topic(name, None) for name in _GRAPH_ONLY_TOPICS}
         has_clock = bool(topics[running.CLOCK].publishers)
@@ -231,10 +256,11 @@ class DoctorNode(Node):
             tuple(self._node_statuses.values()),
             {} if has_clock else {name: float(np.median(values)) for name, values in self._clock_offsets.items()},
             dict(self._conflicting_transforms),
-            self._missing_laser_transform(),
+            tuple(self._missing_laser_transforms()),
             tuple(sorted(namespace for namespace, names in nodes.items() if set(names) & set(running.OUR_NODES))),
             tuple(self._frame_contradictions()),
             tuple(sorted(self._systems)),
+            tuple(self._scans),
         )
 
     def _frame_contradictions(self) -> Iterator[FrameContradiction]:
@@ -268,36 +294,49 @@ class DoctorNode(Node):
     def _base_frame(self) -> str:
         return self._odometry_frames[1] or next(iter(self._transform_odometry), _BASE_FRAME)
 
-    def _configured_mounting(self) -> Mounting | None:
-        """The laser's mounting from the parameter of slam, None where it is not set."""
-        for full in self._parameter_futures:
-            value = self._parameter_value(full, _LASER_POSE)
-            if full.endswith("/slam") and value.double_array_value:
-                return Mounting(np.array(value.double_array_value), 1.0)
-        return None
+    def _slam_parameter(self, parameter: str) -> ParameterValue:
+        """The value of a parameter of slam in this namespace, not set where it has none."""
+        full = f"{self.get_namespace().rstrip('/')}/{COORDINATOR}"
+        return self._parameter_value(full, parameter) if full in self._parameter_futures else ParameterValue()
 
-    def _mounting(self, frame: str) -> Mounting | None:
-        configured, pose = self._configured_mounting(), self._frame_tree.lookup_transform(self._base_frame(), frame)
+    def _configured_mounting(self, topic: str) -> Mounting | None:
+        """The mounting of the laser of a topic from the parameter of slam, None where it is not set."""
+        numbers = self._slam_parameter(_LASER_POSE).double_array_value
+        first = 3 * list(self._scans).index(topic)
+        return Mounting(np.array(numbers[first : first + 3]), 1.0) if len(numbers) >= first + 3 else None
+
+    def _mounting(self, topic: str, frame: str) -> Mounting | None:
+        configured, pose = (
+            self._configured_mounting(topic),
+            self._frame_tree.lookup_transform(self._base_frame(), frame),
+        )
         return configured if configured is not None or pose is None else planar_mounting(pose, f"the laser {frame!r}")
 
-    def _missing_laser_transform(self) -> str:
-        missing = sorted({frame for frame in self._scan_frames() if self._mounting(frame) is None})
-        if not missing:
-            return ""
-        return (
-            f"No transform leads from {self._base_frame()!r} to the scans' frame {missing[0]!r} on /tf_static: start "
-            "robot_state_publisher or static_transform_publisher, or set the parameter laser_pose of slam."
-        )
+    def _mountings(self) -> dict[tuple[str, str], Mounting | None]:
+        """{(topic, frame of its scans): mounting of the laser, None where it is unknown}."""
+        frames = {(topic, frame_name(each.header.frame_id)): None for topic, own in self._scans.items() for each in own}
+        return {(topic, frame): self._mounting(topic, frame) for topic, frame in frames}
 
-    def _scan_frames(self) -> set[str]:
-        return {frame_name(message.header.frame_id) for message in self._scans}
+    def _missing_laser_transforms(self) -> Iterator[str]:
+        missing = {frame for (_, frame), mounting in self._mountings().items() if mounting is None}
+        for frame in sorted(missing):
+            yield (
+                f"No transform leads from {self._base_frame()!r} to the scans' frame {frame!r} on /tf_static: start "
+                "robot_state_publisher or static_transform_publisher, or set the parameter laser_pose of slam."
+            )
 
     def _gather(self) -> Gatherer:
-        """All measurements in the order of their stamps, those of one kind in the order of arrival."""
-        mountings = {frame: self._mounting(frame) or Mounting(np.zeros(3), 1.0) for frame in self._scan_frames()}
-        scans: list[Scan | Odometry] = [self._convert_scan(message, mountings) for message in self._scans]
+        """All measurements in the order of their stamps, those of one kind in the order of arrival.
+
+        Where mountings are unknown, the scans of one of these lasers are examined.
+        """
+        mountings = self._mountings()
+        unknown = [key for key, mounting in mountings.items() if mounting is None]
+        known = {key: mounting for key, mounting in mountings.items() if mounting is not None}
+        known |= dict.fromkeys(unknown[:1], Mounting(np.zeros(3), 1.0))
+        scans = [self._convert_scans(topic, known) for topic in self._scans]
         readings: list[Scan | Odometry] = [*(self._readings or self._transform_odometry[self._base_frame()])]
-        ordered = list(heapq.merge(readings, scans, key=lambda measurement: measurement.stamp))
+        ordered = list(heapq.merge(readings, *scans, key=lambda measurement: measurement.stamp))
         sources = [measurement.stamp for measurement in ordered]
         is_scan = [isinstance(measurement, Scan) for measurement in ordered]
         stamps = running_stamps(sources, is_scan, [False] * len(ordered))
@@ -306,12 +345,18 @@ class DoctorNode(Node):
             gatherer.add(LogRecord(source, _with_stamp(measurement, stamp)))
         return gatherer
 
-    def _convert_scan(self, message: LaserScan, mountings: dict[str, Mounting]) -> Scan:
-        return conversions.scan_from_message(message, *mountings[frame_name(message.header.frame_id)])
+    def _convert_scans(self, topic: str, mountings: Mapping[tuple[str, str], Mounting]) -> list[Scan | Odometry]:
+        """The scans of a topic from lasers with a mounting."""
+        frames = [(topic, frame_name(message.header.frame_id)) for message in self._scans[topic]]
+        return [
+            conversions.scan_from_message(message, *mountings[key])
+            for message, key in zip(self._scans[topic], frames, strict=True)
+            if key in mountings
+        ]
 
     def _message_statistics(self) -> MessageStatistics:
         headers: dict[ScanHeader, int] = defaultdict(int)
-        for scan in self._scans:
+        for scan in (message for own in self._scans.values() for message in own):
             frame = frame_name(scan.header.frame_id)
             headers[ScanHeader(frame, scan.angle_min, scan.angle_max, scan.angle_increment, len(scan.ranges))] += 1
         frames = self._odometry_frames if self._readings else (_ODOM_FRAME, self._base_frame())
