@@ -20,6 +20,7 @@ from hmt_slam_ros.sensors.relative_motion import RelativeMotion, increment_covar
 
 LIMITS = MotionLimits(0.6, math.radians(45.0), 0.5, math.radians(90.0), 0.25)
 STEPS = 900
+STANDING = RelativeMotion(np.zeros(3), increment_covariance(np.zeros(3), CONFIGURATION.motion))
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +39,20 @@ def eastwards(known_building):
     return next(edge.start_direction for edge in known_building.chart.edges if (edge.start, edge.end) == ends)
 
 
+def halves(scan):
+    """What a laser that looks ahead and one that looks back see of a scan all around, in half a circle each."""
+    size, quarter = scan.ranges.size, scan.ranges.size // 4
+    for first, theta in ((quarter, 0.0), (3 * quarter, math.pi)):
+        ranges = np.roll(scan.ranges, -first)[: size // 2]
+        yield replace(scan, ranges=ranges, angle_min=-0.5 * math.pi, laser_pose=np.array([0.0, 0.0, theta]))
+
+
 class Robot:
     """It does what the pilot says; its odometry has 1 % of noise."""
 
-    def __init__(self, pilot, pose):
-        self.pilot, self.pose = pilot, np.array(pose)
+    def __init__(self, pilot, pose, split=lambda scan: [scan]):
+        """:param split: makes the scans of its lasers of one all around."""
+        self.pilot, self.pose, self.split = pilot, np.array(pose), split
         self.rng, self.stamp = np.random.default_rng(0), 0
 
     def go(self, goal, barred=None):
@@ -51,7 +61,11 @@ class Robot:
         for _ in range(STEPS):
             scan = seen_at(self.pose, self.rng, barred)
             self.stamp += 200_000_000
-            command = self.pilot.steer(replace(scan, stamp=self.stamp))
+            first, *others = self.split(replace(scan, stamp=self.stamp))
+            command = self.pilot.steer(first)
+            for part in others:
+                self.pilot.predict(STANDING)
+                command = self.pilot.steer(part)
             yield self.pilot.phase
             if self.pilot.phase in {Phase.THERE, Phase.LOST}:
                 return
@@ -111,9 +125,10 @@ def test_a_robot_goes_from_a_room_to_the_one_behind_the_opposite_door(known_buil
         assert math.dist(robot.pose[:2], place) < 0.3
 
 
-def test_a_lost_robot_turns_at_the_end_of_the_hallway_and_is_confident_before_it_enters(known_building):
+@pytest.mark.parametrize("split", [lambda scan: [scan], halves], ids=["one laser", "two lasers"])
+def test_a_lost_robot_turns_at_the_end_of_the_hallway_and_is_confident_before_it_enters(known_building, split):
     goal = destinations(known_building)[node_at(known_building, 5.0)]
-    robot = Robot(MissionController(known_building, CONFIGURATION, LIMITS), (12.0, 0.1, 0.0))
+    robot = Robot(MissionController(known_building, CONFIGURATION, LIMITS), (12.0, 0.1, 0.0), split)
     phases = []
     for phase in robot.go(goal):
         phases.append(phase)

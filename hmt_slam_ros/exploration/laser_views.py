@@ -34,7 +34,7 @@ class ObstacleView(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _PlacedScan:
+class _EarlierScan:
     """A scan, and the pose of the robot then in its frame now, ``base_T_then``, shape (3,)."""
 
     scan: Scan
@@ -45,7 +45,7 @@ class LaserViews:
     """The newest scan of each laser; lasers are distinguished by their mountings."""
 
     def __init__(self) -> None:
-        self._newest: dict[bytes, _PlacedScan] = {}
+        self._newest: dict[bytes, _EarlierScan] = {}
 
     @property
     def newest_stamp(self) -> int | None:
@@ -56,7 +56,7 @@ class LaserViews:
         """Move the robot by its motion since the last call, shape (3,)."""
         back = se2.inverse(increment)
         self._newest = {
-            key: _PlacedScan(placed.scan, se2.compose(back, placed.pose)) for key, placed in self._newest.items()
+            key: _EarlierScan(placed.scan, se2.compose(back, placed.pose)) for key, placed in self._newest.items()
         }
 
     def add(self, scan: Scan) -> ObstacleView:
@@ -67,11 +67,16 @@ class LaserViews:
             for other, placed in self._newest.items()
             if other != key and abs(scan.stamp - placed.scan.stamp) < _MAX_AGE
         }
-        self._newest = {**recent, key: _PlacedScan(scan, np.zeros(3))}
+        self._newest = {**recent, key: _EarlierScan(scan, np.zeros(3))}
         scans = [placed.scan for placed in self._newest.values()]
-        points = [se2.transform(placed.pose, placed.scan.points) for placed in recent.values()]
+        points = [se2.transform(pose, other.points) for pose, other in self.others]
         joined = np.concatenate((*points, scan.points)) if points else scan.points
         return ObstacleView(scan.stamp, joined, field_of_view(scans))
+
+    @property
+    def others(self) -> list[tuple[Float64, Scan]]:
+        """The scans of the other lasers than that of the last one, each with ``base_T_then`` (3,)."""
+        return [(placed.pose, placed.scan) for placed in list(self._newest.values())[:-1]]
 
     def is_ahead(self, scan: Scan) -> bool:
         """Whether the laser of a scan looks ahead, or none of the others does."""

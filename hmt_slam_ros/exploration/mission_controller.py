@@ -163,13 +163,13 @@ class MissionController:
     def steer(self, scan: Scan) -> MotionCommand:
         """The velocities until the next scan.
 
-        Around obstacles in view of any laser. Places are seen ahead and beside.
+        It avoids what any laser sees. Landmarks are those of lasers that look ahead.
         """
         view = self._views.add(scan)
         if self.room is not None:
             self.room.observe(scan)
         elif self._views.is_ahead(scan):
-            self.estimator.observe(scan)
+            self.estimator.observe(scan, self._views.others)
             self._observe_edges(scan.stamp)
         behavior = self._behaviors.get(self.phase)
         command = _STAND if behavior is None else behavior(view)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from hmt_slam_ros.arrays import Bool, Float64
 from hmt_slam_ros.configuration.landmarks import FeatureParameters
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.grids.virtual_scan import VirtualScan
 from hmt_slam_ros.sensors import Scan
 
 
 class Rays(NamedTuple):
-    """Beams with their free ranges, in the order of bearing.
+    """Beams with their free ranges, those of a scan in the order of bearing.
 
     :ivar origins: shape (n, 2), m.
     :ivar directions: shape (n, 2), unit vectors.
@@ -27,6 +29,16 @@ class Rays(NamedTuple):
     free_range: Float64
     deviations: Float64
     hit: Bool
+
+    def move(self, pose: Float64) -> Rays:
+        """The beams in another frame, in which theirs has a pose, shape (3,)."""
+        turned = se2.transform(np.array([0.0, 0.0, pose[2]]), self.directions)
+        return self._replace(origins=se2.transform(pose, self.origins), directions=turned)
+
+
+def join_rays(parts: Sequence[Rays]) -> Rays:
+    """The beams of several scans, one after the other."""
+    return parts[0] if len(parts) == 1 else Rays(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def rays_from_scan(scan: Scan, features: FeatureParameters) -> Rays:

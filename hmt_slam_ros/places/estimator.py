@@ -13,7 +13,7 @@ Tomatis, Nourbakhsh and Siegwart (2003), section 3.3:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -27,7 +27,7 @@ from hmt_slam_ros.landmarks.landmark_map import LandmarkMap
 from hmt_slam_ros.landmarks.landmarks import NO_CORNERS, OPENING, concatenate_landmarks, extract_corners
 from hmt_slam_ros.landmarks.line_extraction import Lines, extract_lines
 from hmt_slam_ros.landmarks.openings import NO_OPENINGS, Openings, extract_openings
-from hmt_slam_ros.landmarks.rays import Rays, rays_from_scan
+from hmt_slam_ros.landmarks.rays import Rays, join_rays, rays_from_scan
 from hmt_slam_ros.places.chart import END_NODE_TO_WALL
 from hmt_slam_ros.places.corridor_frame import (
     ALIGNMENT_TOLERANCE,
@@ -202,11 +202,14 @@ class PlaceEstimator:
         """Move the robot."""
         self.frame.predict(step)
 
-    def observe(self, scan: Scan) -> PositionBelief | None:
-        """The belief after a scan; None before the first node."""
+    def observe(self, scan: Scan, others: Sequence[tuple[Float64, Scan]] = ()) -> PositionBelief | None:
+        """The belief after a scan; None before the first node.
+
+        :param others: scans of other lasers, each with ``base_T_then`` (3,); they show how much space is around.
+        """
         frame, features = self.frame, self._features
         lines, rays = extract_lines(scan, features), rays_from_scan(scan, features)
-        frame.observe(lines, rays)
+        frame.observe(lines, join_rays([rays, *(rays_from_scan(other, features).move(pose) for pose, other in others)]))
         if not frame.is_initialized:
             return None
         if self._begins_at_node and self.belief is None:
