@@ -20,6 +20,7 @@ from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidat
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     HypothesisState,
 )
+from hmt_slam_ros.topological_inference.marked_places import NO_MARKS
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
 OPTIONS = replace(Configuration().tsbi, relocalization_probability=0.8, relocalization_share=0.6, hint_probability=0.7)
@@ -58,28 +59,35 @@ class GivenSearch(SimpleNamespace):
     """Branching whose search finds a distribution that is given, after some events."""
 
     def __init__(self, events=1, **given):
-        super().__init__(first_areas=[], remaining=events, unexamined={}, **given)
+        super().__init__(first_areas=[], remaining=events, unexamined={}, marked=None, **given)
         self.search = SimpleNamespace(gating=CandidateGating(OPTIONS))
         self.map_search = SimpleNamespace(
             work=EventWork(),
-            check_candidates=lambda _map, search, _clutter, _hint=None: (search, True),
+            check_candidates=lambda _map, search, _clutter, _hint=None, _marks=None: (search, True),
             begin=self.begin,
             continue_search=self.go_on,
             search_now=lambda hybrid_map, search, area, _clutter: self.go_on(hybrid_map, search, area),
             plausible_areas=lambda _map, _found: frozenset({1, 2}),
-            is_conclusive=lambda _map, _search, _clutter, _hint=None: self.remaining == 0,
+            is_conclusive=lambda _map, _search, _clutter, _hint=None, _marks=None: self.remaining == 0,
         )
 
     def begin(self, _hybrid_map, poses, before, hint=None, only=()):
         self.requested, self.only = (poses, before, hint), only
         return GlobalSearch(poses, before, 3, dict(self.unexamined), self.found.candidates)
 
-    def go_on(self, _hybrid_map, search, first=None):
+    def go_on(self, _hybrid_map, search, first=None, _marks=None):
         self.first_areas.append(first)
         self.remaining -= 1
         return search if self.remaining else replace(search, unexamined={})
 
-    def localize_globally(self, _parent, search, hint=None):
+    def find_marked_places(self, _parent, _search):
+        return NO_MARKS
+
+    def is_marked(self, keyframes, before):
+        assert min(keyframes) >= before
+        return self.marked in keyframes
+
+    def localize_globally(self, _parent, search, hint=None, _marks=None):
         assert search.poses is self.requested[0]
         assert (hint is None) is (self.requested[2] is None)
         return self.found

@@ -64,7 +64,7 @@ def test_a_search_goes_on_with_its_keyframes_until_it_is_over():
         assert list(child.state.localization.search.poses) == [21, 22, 23, 24, 25]
         own = parent.hybrid_map.keyframes(5)
         parent.hybrid_map.set_keyframe(max(own) + 1, 5, se2.compose(own[max(own)], [0.5, 0.0, 0.1]))
-        assert not relocalization.is_search_due(parent, OPTIONS)
+        assert not relocalization.is_search_due(branching, parent)
     (child,) = relocalization.update_relocalization(branching, parent).children
     parent = replace(parent, state=child.state)
     lost = parent.state.localization
@@ -73,15 +73,23 @@ def test_a_search_goes_on_with_its_keyframes_until_it_is_over():
     assert not relocalization.is_searching(parent)
     due = []
     for keyframe in range(28, 31):
-        due.append(relocalization.is_search_due(parent, OPTIONS))
+        due.append(relocalization.is_search_due(branching, parent))
         parent.hybrid_map.set_keyframe(keyframe, 5, np.zeros(3))
     assert due == [False, False, False]
-    assert relocalization.is_search_due(parent, OPTIONS)
-    assert not relocalization.is_search_due(make_parent(Tracking()), OPTIONS)
+    assert relocalization.is_search_due(branching, parent)
+    assert not relocalization.is_search_due(branching, make_parent(Tracking()))
     branching.remaining = 1
     relocalization.update_relocalization(branching, parent)
     assert branching.first_areas[3:] == [1]
     assert branching.only == {1, 2}
+
+
+def test_a_robot_at_a_mark_of_the_map_is_searched_after_three_keyframes():
+    branching, parent = GivenSearch(options=OPTIONS, found=distribution()), make_parent(Lost(23))
+    assert not relocalization.is_search_due(branching, parent)
+    branching.marked = 24
+    assert relocalization.is_search_due(branching, parent)
+    assert not relocalization.is_search_due(branching, make_parent(Lost(24)))
 
 
 class ExhaustingSearch(GivenSearch):
@@ -91,12 +99,12 @@ class ExhaustingSearch(GivenSearch):
         super().__init__(**given)
         self.map_search.check_candidates = self.check
 
-    def go_on(self, hybrid_map, search, first=None):
-        search = super().go_on(hybrid_map, search, first)
+    def go_on(self, hybrid_map, search, first=None, marks=None):
+        search = super().go_on(hybrid_map, search, first, marks)
         self.map_search.work.add(event_work._MAX_WORK)
         return replace(search, unexamined={3: 0.1} if search.candidates else {})
 
-    def check(self, _hybrid_map, search, _clutter, _hint=None):
+    def check(self, _hybrid_map, search, _clutter, _hint=None, _marks=None):
         return search, not (search.candidates and self.map_search.work.is_exhausted)
 
 

@@ -51,6 +51,7 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import (
 )
 from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingPriors
 from hmt_slam_ros.topological_inference.map_search import MapSearch
+from hmt_slam_ros.topological_inference.marked_places import NO_MARKS, MarkedPlaceFinder, MarkedPlaces
 from hmt_slam_ros.topological_inference.marks import AreaMark, MarkEvidence, MarkMemory
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 from hmt_slam_ros.topological_inference.statements import (
@@ -134,7 +135,7 @@ class Branching:
         self.map_search = MapSearch(configuration, scans, self.search.work)
         self.landmarks = None if landmarks is None else landmarks(configuration, scans)
         self.marks = MarkMemory()
-        self._mark_evidence = MarkEvidence(configuration)
+        self._mark_evidence, self._marked_places = MarkEvidence(configuration), MarkedPlaceFinder(configuration)
         self.statements = PlaceStatements(StatementEvidence(configuration.tsbi), replica)
         self.options = configuration.tsbi
         self.kidnapping_priors = KidnappingPriors.from_configuration(configuration)
@@ -160,19 +161,33 @@ class Branching:
         self.statements.queue = state.statements
 
     def localize_globally(
-        self, parent: Parent, search: GlobalSearch, pose_hint: PoseHint | None = None
+        self,
+        parent: Parent,
+        search: GlobalSearch,
+        pose_hint: PoseHint | None = None,
+        marks: MarkedPlaces = NO_MARKS,
     ) -> PoseDistribution:
         """The distribution of the keyframes' pose in the whole map, as far as it was searched.
 
         Landmarks count from the second search with a candidate on, since one search alone localizes nobody.
 
         :param pose_hint: of the reference.
+        :param marks: where marks put the keyframes.
         """
-        distribution = self.map_search.localize(parent.hybrid_map, search, parent.clutter, pose_hint)
+        distribution = self.map_search.localize(parent.hybrid_map, search, parent.clutter, pose_hint, marks)
         lost = parent.state.localization
         if self.landmarks is None or not isinstance(lost, Lost) or lost.candidate is None:
             return distribution
         return self.landmarks.weigh(distribution, parent.hybrid_map, search.poses, search.before)
+
+    def find_marked_places(self, parent: Parent, search: GlobalSearch) -> MarkedPlaces:
+        """Where marks put the keyframes of a search."""
+        return self._marked_places.find(parent.hybrid_map, search.poses, search.before, self.marks)
+
+    def is_marked(self, keyframes: Collection[int], before: int) -> bool:
+        """Whether a mark is visited at one of some keyframes that was visited before another one."""
+        repeated = self.marks.repeated_visits(keyframes)
+        return any(one.keyframe < before for _, earlier in repeated for one in earlier)
 
     def look_ahead(self, parents: Sequence[Parent]) -> None:
         """Prepare the next search, at an event without one."""

@@ -35,6 +35,7 @@ from hmt_slam_ros.topological_inference.global_scan_matching import (
     PoseCandidate,
     region_neighborhood,
 )
+from hmt_slam_ros.topological_inference.marked_places import NO_MARKS, MarkedPlaces
 from hmt_slam_ros.topological_inference.place_recognition import PerceptualAliasing
 from hmt_slam_ros.topological_inference.pose_distribution import MIN_PROBABILITY, UNMAPPED_PRIOR, PoseDistribution
 
@@ -132,17 +133,19 @@ def continue_search(
     hybrid_map: HybridMap,
     work: EventWork,
     first: int | None = None,
+    marks: MarkedPlaces = NO_MARKS,
 ) -> GlobalSearch:
-    """The search after the regions of one event, the most probable by their appearance.
+    """The search after the regions of one event, the most probable by their appearance and by marks.
 
     The map of a region and the match with it are two steps. Areas that the map lacks by now are dropped.
 
     :param work: of the event, to which that of the search is added.
     :param first: the area whose region comes first, if it was not searched yet.
+    :param marks: where marks put the keyframes.
     """
     search = _without_missing_areas(search, hybrid_map)
     while search.unexamined and not work.is_exhausted:
-        search = _step(search, matcher, hybrid_map, work, first)
+        search = _step(search, matcher, hybrid_map, work, first, marks)
     return search
 
 
@@ -167,10 +170,15 @@ def _without_missing_areas(search: GlobalSearch, hybrid_map: HybridMap) -> Globa
 
 
 def _step(
-    search: GlobalSearch, matcher: GlobalScanMatcher, hybrid_map: HybridMap, work: EventWork, first: int | None
+    search: GlobalSearch,
+    matcher: GlobalScanMatcher,
+    hybrid_map: HybridMap,
+    work: EventWork,
+    first: int | None,
+    marks: MarkedPlaces = NO_MARKS,
 ) -> GlobalSearch:
     """The search after the next map was made, or the next region was matched."""
-    probabilities = dict(search.unexamined)
+    probabilities = _marked_probabilities(search, marks)
     if first is not None and first in probabilities:
         probabilities[first] = 1.0
     region = matcher.find_region(hybrid_map, search.before, probabilities)
@@ -191,6 +199,17 @@ def _step(
     )
 
 
+def _flat_prior(search: GlobalSearch) -> float:
+    """Prior probability of each area."""
+    return (1.0 - UNMAPPED_PRIOR) / max(1, search.areas)
+
+
+def _marked_probabilities(search: GlobalSearch, marks: MarkedPlaces) -> dict[int, float]:
+    """{area that was not searched yet: its probability by appearance, with the factor of marks}."""
+    factors = marks.area_factors(search.unexamined, _flat_prior(search))
+    return {area: probability * factors[area] for area, probability in search.unexamined.items()}
+
+
 def check_candidates(
     search: GlobalSearch,
     matcher: GlobalScanMatcher,
@@ -199,6 +218,7 @@ def check_candidates(
     hybrid_map: HybridMap,
     clutter: Clutter,
     pose_hint: PoseHint | None = None,
+    marks: MarkedPlaces = NO_MARKS,
 ) -> tuple[GlobalSearch, bool]:
     """The search after the walls of its probable candidates were checked, and whether all were at this event.
 
@@ -207,7 +227,7 @@ def check_candidates(
     """
     search = _without_missing_areas(search, hybrid_map)
     candidates = list(search.candidates)
-    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint)
+    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint, marks)
     likely = np.flatnonzero(_probabilities(log_weights, log_rest) >= _MIN_WALL_CHECK_PROBABILITY)
     left = [n for n in likely.tolist() if candidates[n].walls is None]
     while left and not work.is_exhausted:
@@ -224,6 +244,7 @@ def localize_globally(
     hybrid_map: HybridMap,
     clutter: Clutter,
     pose_hint: PoseHint | None = None,
+    marks: MarkedPlaces = NO_MARKS,
 ) -> PoseDistribution:
     """The distribution of the pose of some keyframes in the whole map, as far as it was searched.
 
@@ -232,8 +253,9 @@ def localize_globally(
     :param aliasing_prior: prior probability that keyframes match an area in which they do not lie.
     :param clutter: usual rate of contradictions of the robot's map, where that is above the rate of maps.
     :param pose_hint: of the reference.
+    :param marks: where marks put the keyframes.
     """
-    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint)
+    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint, marks)
     wall_rate = max(WALLS_OUTLIER_RATE, _OLD_MAP_FACTOR * clutter.wall_outlier_rate)
     for n, candidate in enumerate(search.candidates):
         if candidate.walls is not None:
@@ -265,23 +287,30 @@ def is_conclusive(
     clutter: Clutter,
     pose_hint: PoseHint | None,
     probability: float,
+    marks: MarkedPlaces = NO_MARKS,
 ) -> bool:
     """Whether the search is over: all areas were searched, or a candidate is probable in spite of those that were not.
 
     Candidates that were tested in vain wait for another one, or for the end of the search.
 
     :param probability: of such a candidate, before walls count against it.
+    :param marks: where marks put the keyframes.
     """
     if not search.unexamined:
         return True
     if len(search.candidates) <= search.refuted:
         return False
-    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint)
+    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint, marks)
     return bool(_probabilities(log_weights, log_rest).max(initial=0.0) >= probability)
 
 
 def _log_weights(
-    search: GlobalSearch, aliasing_prior: float, hybrid_map: HybridMap, clutter: Clutter, pose_hint: PoseHint | None
+    search: GlobalSearch,
+    aliasing_prior: float,
+    hybrid_map: HybridMap,
+    clutter: Clutter,
+    pose_hint: PoseHint | None,
+    marks: MarkedPlaces,
 ) -> tuple[list[float], float]:
     """Log of the weight of every candidate, and of the rest: unmapped ground, and the areas that were not searched.
 
@@ -289,12 +318,14 @@ def _log_weights(
     tested with the best match. Between candidates the surfaces also count that are known at one and not at the other.
     A pose hint replaces the flat prior by one as wide as its covariance. In an area that was not searched keyframes
     may match as well as at the best candidate, which is there by chance then, as improbable as it is distinctive.
+    Marks make the flat prior a mixture.
     """
     log_mass: dict[int, float] = {}
     for candidate in search.candidates:
         log_mass[candidate.area] = float(np.logaddexp(log_mass.get(candidate.area, -math.inf), candidate.mode.log_mass))
     max_log_mass = max(log_mass.values(), default=0.0)
-    log_flat = math.log((1.0 - UNMAPPED_PRIOR) / max(1, search.areas))
+    log_flat = math.log(_flat_prior(search))
+    log_marks = marks.log_factors(hybrid_map, search.candidates, _flat_prior(search))
     log_priors = _log_hint_priors(search, hybrid_map, pose_hint) if pose_hint else {}
     outlier_rate = max(MAPS_OUTLIER_RATE, clutter.beam_outlier_rate)
     aliasing = PerceptualAliasing(aliasing_prior)
@@ -308,11 +339,11 @@ def _log_weights(
             + MAP_IN_MAP.log_likelihood_ratio(c.agreement, outlier_rate)
         )
         distinctiveness = aliasing.log_distinctiveness(c.agreement.matched_share, already_expected=False)
-        log_weights.append(log_priors.get(n, log_flat) + log_there + distinctiveness)
+        log_weights.append(log_priors.get(n, log_flat) + log_there + distinctiveness + log_marks[n])
         log_chance = max(log_chance, log_there)
-    unexamined = (1.0 - UNMAPPED_PRIOR) * sum(search.unexamined.values())
+    unexamined = (1.0 - UNMAPPED_PRIOR) * sum(_marked_probabilities(search, marks).values())
     log_unexamined = math.log(max(unexamined, MIN_PROBABILITY)) + log_chance
-    return log_weights, float(np.logaddexp(math.log(UNMAPPED_PRIOR), log_unexamined))
+    return log_weights, float(np.logaddexp(math.log(UNMAPPED_PRIOR) + marks.log_unmarked, log_unexamined))
 
 
 def _other_shares(search: GlobalSearch) -> list[float]:

@@ -25,6 +25,7 @@ from hmt_slam_ros.topological_inference.global_localization import (
     search_region,
 )
 from hmt_slam_ros.topological_inference.global_scan_matching import FreeSpaceCheck, GlobalScanMatcher
+from hmt_slam_ros.topological_inference.marked_places import NO_MARKS, MarkedPlaces
 from hmt_slam_ros.topological_inference.place_recognition import ScanDescriptors
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 
@@ -91,12 +92,15 @@ class MapSearch:
         probabilities = self._descriptors.area_probabilities(list(poses), known)
         return begin_search(hybrid_map, poses, before, probabilities, pose_hint, self._options.place_radius, only)
 
-    def continue_search(self, hybrid_map: HybridMap, search: GlobalSearch, first: int | None = None) -> GlobalSearch:
+    def continue_search(
+        self, hybrid_map: HybridMap, search: GlobalSearch, first: int | None = None, marks: MarkedPlaces = NO_MARKS
+    ) -> GlobalSearch:
         """The search after one event.
 
         :param first: the area whose region comes first, if it was not searched yet.
+        :param marks: where marks put the keyframes.
         """
-        return continue_search(search, self._matcher, hybrid_map, self.work, first)
+        return continue_search(search, self._matcher, hybrid_map, self.work, first, marks)
 
     def search_now(self, hybrid_map: HybridMap, search: GlobalSearch, area: int, clutter: Clutter) -> GlobalSearch:
         """The search after the region of an area and the walls there, whatever work they take, and others meanwhile.
@@ -112,37 +116,55 @@ class MapSearch:
         return search
 
     def check_candidates(
-        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
+        self,
+        hybrid_map: HybridMap,
+        search: GlobalSearch,
+        clutter: Clutter,
+        pose_hint: PoseHint | None = None,
+        marks: MarkedPlaces = NO_MARKS,
     ) -> tuple[GlobalSearch, bool]:
         """The search after the walls of its probable candidates were checked, and whether all were at this event.
 
         :param clutter: usual rate of contradictions of the robot's map.
         :param pose_hint: of the reference.
+        :param marks: where marks put the keyframes.
         """
         prior = self._options.aliasing_prior
-        return check_candidates(search, self._matcher, self.work, prior, hybrid_map, clutter, pose_hint)
+        return check_candidates(search, self._matcher, self.work, prior, hybrid_map, clutter, pose_hint, marks)
 
     def is_conclusive(
-        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
+        self,
+        hybrid_map: HybridMap,
+        search: GlobalSearch,
+        clutter: Clutter,
+        pose_hint: PoseHint | None = None,
+        marks: MarkedPlaces = NO_MARKS,
     ) -> bool:
         """Whether the search is over.
 
         :param clutter: usual rate of contradictions of the robot's map.
         :param pose_hint: of the reference.
+        :param marks: where marks put the keyframes.
         """
         probability = self._options.relocalization_probability
-        return is_conclusive(search, self._options.aliasing_prior, hybrid_map, clutter, pose_hint, probability)
+        return is_conclusive(search, self._options.aliasing_prior, hybrid_map, clutter, pose_hint, probability, marks)
 
     def localize(
-        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, pose_hint: PoseHint | None = None
+        self,
+        hybrid_map: HybridMap,
+        search: GlobalSearch,
+        clutter: Clutter,
+        pose_hint: PoseHint | None = None,
+        marks: MarkedPlaces = NO_MARKS,
     ) -> PoseDistribution:
         """The distribution of the keyframes' pose in the whole map, as far as it was searched.
 
         :param clutter: usual rate of contradictions of the robot's map.
         :param pose_hint: of the reference.
+        :param marks: where marks put the keyframes.
         """
         prior = self._options.aliasing_prior
-        return localize_globally(search, prior, hybrid_map, clutter, pose_hint)
+        return localize_globally(search, prior, hybrid_map, clutter, pose_hint, marks)
 
     def plausible_areas(self, hybrid_map: HybridMap, distribution: PoseDistribution) -> frozenset[int]:
         """The areas in which the keyframes of a search may be, and those around; none where they may be anywhere.

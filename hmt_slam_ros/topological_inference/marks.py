@@ -41,7 +41,7 @@ _MEDIAN_DISTANCE2 = 2.366
 _MAX_HEADING_DEVIATION = 1.0
 """Deviation of a heading from which arcs do not tell whether a mark agrees with them, rad."""
 
-_PLACEMENT_COVARIANCE = np.diag([0.1**2, 0.1**2, math.radians(2.0) ** 2])
+PLACEMENT_COVARIANCE = np.diag([0.1**2, 0.1**2, math.radians(2.0) ** 2])
 """Covariance of a keyframe's pose in its area, and of the motion from an observation to its keyframe."""
 
 _FUSION_PROBABILITY = 0.9
@@ -84,17 +84,20 @@ class MarkMemory:
 
     visits: Mapping[str, tuple[MarkVisit, ...]] = field(default_factory=dict)
 
-    def after_event(self, event: int, observations: Sequence[MarkObservation], anchor: Anchor | None) -> MarkMemory:
+    def after_event(
+        self, event: int, observations: Sequence[MarkObservation], anchor: Anchor | None, since: int = 0
+    ) -> MarkMemory:
         """The memory after a keyframe event.
 
         :param anchor: of its observations; without one no visit begins.
+        :param since: event since which the robot is lost; visits before have ended.
         """
         if not observations:
             return self
         visits = dict(self.visits)
         for observation in observations:
             known = visits.get(observation.name, ())
-            if known and event - known[-1].last_event < _VISIT_GAP:
+            if known and known[-1].last_event >= since and event - known[-1].last_event < _VISIT_GAP:
                 visits[observation.name] = (*known[:-1], replace(known[-1], last_event=event))
             elif anchor is not None and (known or len(visits) < _MAX_MARKS):
                 pose = observation.pose.compose(PoseGaussian.from_pose(anchor.pose))
@@ -182,7 +185,7 @@ class MarkEntry(NamedTuple):
 
     def shares(self, modes: Sequence[MatchMode]) -> list[float]:
         """The share of each mode of a match in the place, 1 together where one agrees with the mark well."""
-        agreements = [_agreement2(self.belief.mahalanobis2(mode.pose)) for mode in modes]
+        agreements = [agreement2(self.belief.mahalanobis2(mode.pose)) for mode in modes]
         masses = np.exp([mode.log_mass - max(other.log_mass for other in modes) for mode in modes]) * agreements
         total = float(np.sum(masses))
         return [float(mass) / total * max(agreements) if total > 0.0 else 0.0 for mass in masses]
@@ -294,13 +297,13 @@ class MarkEvidence:
         self, located: Mapping[int, _LocatedKeyframe], query: Query, visit: MarkVisit, before: Sequence[MarkVisit]
     ) -> list[_VisitPair]:
         """The relative poses of a visit of the query, and those before that are in the map."""
-        reference = PoseGaussian(se2.inverse(query.poses[visit.keyframe]), _PLACEMENT_COVARIANCE)
+        reference = PoseGaussian(se2.inverse(query.poses[visit.keyframe]), PLACEMENT_COVARIANCE)
         mark_T_reference = visit.pose.compose(reference)
         pairs = []
         for one in before:
             if (place := located.get(one.keyframe)) is not None:
                 arcs = place.path.inverse().compose(query.belief)
-                keyframe = PoseGaussian(place.pose, _PLACEMENT_COVARIANCE)
+                keyframe = PoseGaussian(place.pose, PLACEMENT_COVARIANCE)
                 belief = keyframe.compose(one.pose.inverse()).compose(mark_T_reference)
                 prior = PoseGaussian(arcs.mean, self._arc_scale2 * arcs.covariance)
                 pairs.append(_VisitPair(place.area, prior, belief))
@@ -311,7 +314,7 @@ class MarkEvidence:
         if _is_unknown(prior):
             return 1.0
         distance2 = prior.mahalanobis2(belief)
-        return _agreement2(distance2) if distance2 <= self._gate else 0.0
+        return agreement2(distance2) if distance2 <= self._gate else 0.0
 
 
 class _LocatedKeyframe(NamedTuple):
@@ -345,5 +348,6 @@ def _is_unknown(prior: PoseGaussian) -> bool:
     return bool(prior.covariance[2, 2] > _MAX_HEADING_DEVIATION**2)
 
 
-def _agreement2(distance2: float) -> float:
+def agreement2(distance2: float) -> float:
+    """How well two visits agree by their squared Mahalanobis distance: 1 for half of the right ones."""
     return math.exp(-0.5 * max(0.0, distance2 - _MEDIAN_DISTANCE2))

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseHint
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate, is_certain
 from hmt_slam_ros.topological_inference.hypothesis_tree import Lost, PoseInArea, Tracking
+from hmt_slam_ros.topological_inference.marked_places import NO_MARKS, MarkedPlaces
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 from hmt_slam_ros.topological_inference.relocalization_arcs import hinted_arcs, hinted_pose, refuted_arcs
 
@@ -52,6 +54,9 @@ _REFUTING_PROBABILITY = 0.9
 
 _PROBABILITY_FLOOR = 1e-12
 """Smallest probability of unmapped ground in a Bayes factor."""
+
+_MARKED_KEYFRAMES = 3
+"""Keyframes after which a robot that visits a mark of the map is searched."""
 
 _MAX_KEYFRAMES = 40
 """Most keyframes that are searched in the map, the newest."""
@@ -127,13 +132,19 @@ def _relocalize_at_hint(
     return branches._replace(children=[replace(child, arcs=child.arcs or arcs) for child in branches.children])
 
 
-def is_search_due(parent: Parent, options: InferenceParameters) -> bool:
-    """Whether a lost hypothesis has enough keyframes since the last search for another one."""
+def is_search_due(branching: Branching, parent: Parent) -> bool:
+    """Whether a lost hypothesis has enough keyframes since the last search for another one.
+
+    Fewer suffice with a pose hint, or if they are at a mark of the map.
+    """
     lost = parent.state.localization
     if not isinstance(lost, Lost) or lost.search is not None:
         return False
     newer = _poses_since(parent, max(lost.since, lost.searched + 1))
-    return len(newer) >= (options.recheck_keyframes if lost.pose_hint is None else 1)
+    if lost.pose_hint is not None:
+        return bool(newer)
+    enough = branching.options.recheck_keyframes
+    return len(newer) >= enough or (len(newer) >= _MARKED_KEYFRAMES and branching.is_marked(newer, lost.since))
 
 
 def is_searching(parent: Parent) -> bool:
@@ -155,17 +166,17 @@ def update_relocalization(branching: Branching, parent: Parent) -> Branches:
     if branching.map_search.work.is_exhausted:
         return Branches([parent.unchanged_child()])
     search = lost.search or _begin_search(branching, parent, lost)
-    if lost.search is None or not _is_conclusive(branching, parent, lost, search):
+    prior = _search_prior(branching, parent, lost, search)
+    if lost.search is None or not _is_conclusive(branching, parent, lost, search, prior):
         first = None if lost.candidate is None else lost.candidate.area
-        search = branching.map_search.continue_search(parent.hybrid_map, search, first)
-    is_over = _is_conclusive(branching, parent, lost, search)
-    hint = _hint_of_first(lost, search.poses)
+        search = branching.map_search.continue_search(parent.hybrid_map, search, first, prior.marks)
+    is_over = _is_conclusive(branching, parent, lost, search, prior)
     if is_over:
-        search, is_over = branching.map_search.check_candidates(parent.hybrid_map, search, parent.clutter, hint)
+        search, is_over = branching.map_search.check_candidates(parent.hybrid_map, search, parent.clutter, *prior)
     if not is_over:
         return Branches([_child_with_localization(parent, replace(lost, search=search))])
     after = replace(lost, search=None, searched=max(search.poses))
-    branches = _conclude_search(branching, parent, after, search, hint)
+    branches = _conclude_search(branching, parent, after, search, prior)
     # Walls and the odds of a kidnapping may count against a candidate: the rest is searched first then.
     if search.unexamined and all(_is_without_candidate(child) for child in branches.children):
         search = replace(search, refuted=len(search.candidates))
@@ -173,12 +184,27 @@ def update_relocalization(branching: Branching, parent: Parent) -> Branches:
     return branches
 
 
-def _is_conclusive(branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch) -> bool:
+class _SearchPrior(NamedTuple):
+    """What is known of the pose of a search's reference beside scans.
+
+    :ivar hint: by a person.
+    :ivar marks: where marks put it; none with a hint.
+    """
+
+    hint: PoseHint | None
+    marks: MarkedPlaces
+
+
+def _search_prior(branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch) -> _SearchPrior:
+    hint = _hint_of_first(lost, search.poses)
+    return _SearchPrior(hint, NO_MARKS if hint is not None else branching.find_marked_places(parent, search))
+
+
+def _is_conclusive(branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch, prior: _SearchPrior) -> bool:
     """Whether the search is over; one that may confirm a candidate goes through all areas that are left to it."""
     if lost.candidate is not None and search.unexamined:
         return False
-    hint = _hint_of_first(lost, search.poses)
-    return branching.map_search.is_conclusive(parent.hybrid_map, search, parent.clutter, hint)
+    return branching.map_search.is_conclusive(parent.hybrid_map, search, parent.clutter, *prior)
 
 
 def _is_without_candidate(child: Child) -> bool:
@@ -196,23 +222,24 @@ def _begin_search(branching: Branching, parent: Parent, lost: Lost) -> GlobalSea
 
 
 def _conclude_search(
-    branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch, hint: PoseHint | None
+    branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch, prior: _SearchPrior
 ) -> Branches:
     """The children after a search: still lost, or relocalized.
 
     :param lost: the state after it.
-    :param hint: for the reference of the search.
+    :param prior: of the search.
     """
     poses, keyframes = search.poses, _poses_since(parent, lost.since)
     common = keyframes.keys() & poses.keys()
     if not common:
         return Branches([_child_with_localization(parent, lost)])
     newest, is_kidnapped = max(common), lost.tracked_pose is not None
-    distribution = branching.localize_globally(parent, search, hint)
-    if is_kidnapped:
-        distribution = distribution.with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
-    distribution = _with_false_alarm(parent.hybrid_map, lost, distribution, poses)
-    parent, lost = _reweight_by_evidence(parent, lost, distribution, poses)
+    distribution = _localize(branching, parent, lost, search, prior)
+    # Marks have weighed against the hypotheses that are not lost already.
+    unmarked = distribution
+    if is_kidnapped and prior.marks.marks:
+        unmarked = _localize(branching, parent, lost, search, prior._replace(marks=NO_MARKS))
+    parent, lost = _reweight_by_evidence(parent, lost, unmarked, poses)
     lost = _after_refutation(lost, distribution, poses)
     best = distribution.best
     if best is None or not _is_decisive(*best, branching.options, is_kidnapped=is_kidnapped):
@@ -225,7 +252,7 @@ def _conclude_search(
         candidate=_pose_in_area(candidate, poses, max(poses)),
         plausible_areas=branching.map_search.plausible_areas(parent.hybrid_map, distribution),
     )
-    if (hint is not None and probability >= branching.options.hint_probability) or _confirms_candidate(
+    if (prior.hint is not None and probability >= branching.options.hint_probability) or _confirms_candidate(
         parent.hybrid_map, lost, candidate, poses
     ):
         reference = se2.compose(keyframes[newest], se2.inverse(poses[newest]))
@@ -236,6 +263,16 @@ def _conclude_search(
     else:
         children = [_child_with_localization(parent, with_candidate)]
     return Branches(children, True, pose_distribution=distribution)
+
+
+def _localize(
+    branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch, prior: _SearchPrior
+) -> PoseDistribution:
+    """The distribution of the pose of the keyframes that were searched."""
+    distribution = branching.localize_globally(parent, search, *prior)
+    if lost.tracked_pose is not None:
+        distribution = distribution.with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
+    return _with_false_alarm(parent.hybrid_map, lost, distribution, search.poses)
 
 
 def _after_refutation(lost: Lost, distribution: PoseDistribution, poses: Mapping[int, Pose]) -> Lost:

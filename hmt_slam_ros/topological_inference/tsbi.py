@@ -232,7 +232,16 @@ class Tsbi:
         self._branching.keep_scans(keyframe.sequence, keyframe.scan, wanted)
         if keyframe.marks:
             marks = self._branching.marks
-            self._branching.marks = marks.after_event(keyframe.sequence, keyframe.marks, self._anchor(keyframe))
+            self._branching.marks = marks.after_event(
+                keyframe.sequence, keyframe.marks, self._anchor(keyframe), self._lost_since(keyframe)
+            )
+
+    def _lost_since(self, keyframe: Keyframe) -> int:
+        """The event since which the robot is lost under any hypothesis at a keyframe, 0 if it is not."""
+        if keyframe.motion_unknown:
+            return keyframe.sequence
+        localizations = (state.localization for state in self._state.hypothesis_states.values())
+        return max((lost.since for lost in localizations if isinstance(lost, Lost)), default=0)
 
     def _anchor(self, keyframe: Keyframe) -> Anchor | None:
         """The keyframe that observations of marks are relative to: this one if it is stored, or the nearest one."""
@@ -455,7 +464,7 @@ class Tsbi:
         if state.comparison is not None:
             # A search and a comparison that both go on take turns.
             is_recheck_due = keyframe.sequence % 2 == 0
-        if is_search_due(parent, self._options) or (is_searching(parent) and not is_recheck_due):
+        if is_search_due(self._branching, parent) or (is_searching(parent) and not is_recheck_due):
             branches = update_relocalization(self._branching, parent)
             return branches if keyframe.mapping else accept_relocalization(branches)
         if state.comparison is not None:
