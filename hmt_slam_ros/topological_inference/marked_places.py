@@ -28,6 +28,9 @@ _MAX_MARKS = 8
 
 _SIGMA = 1.0
 """Largest deviation of an area's position beside that of an earlier visit, m: that of an arc traveled once."""
+
+_GATE = chi_square_gate(0.999)
+"""Gate of the squared Mahalanobis distance between a candidate and a pose by a right mark."""
 """Gate of the squared Mahalanobis distance between a candidate and a pose by a right mark."""
 
 
