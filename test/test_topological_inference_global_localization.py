@@ -1,6 +1,7 @@
 """Distributions over the pose of a lost robot, by Bayes' rule."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -38,6 +39,7 @@ from hmt_slam_ros.topological_inference.global_scan_matching import (
     Region,
     RegionMatch,
 )
+from hmt_slam_ros.topological_inference.marked_places import NO_MARKS, MarkedPlaces, MarkedPose
 from hmt_slam_ros.topological_inference.pose_distribution import (
     UNMAPPED_PRIOR,
     PoseDistribution,
@@ -332,3 +334,21 @@ def test_areas_are_plausible_where_a_candidate_is_and_around_if_the_keyframes_ar
     doubted = PoseDistribution(candidates, np.array([0.4, 0.05, 0.04]))
     assert plausible_areas(doubted, hybrid_map, 3.0) == frozenset()
     assert plausible_areas(PoseDistribution((), np.zeros(0)), hybrid_map, 3.0) == frozenset()
+
+
+def test_the_area_that_a_mark_points_to_is_searched_first_and_ends_the_search():
+    """Without the mark the first area that fits may be there by chance, as may all that were not searched."""
+    walls = Agreement(0, 0, 0)
+    areas = dict.fromkeys(range(20), 0.05)
+    sharp = PoseGaussian(np.zeros(3), np.diag([0.1, 0.1, 0.05]) ** 2)
+    marks = MarkedPlaces(((MarkedPose(7, sharp),),), 0.05)
+    for own, first, conclusive in ((marks, 7, True), (NO_MARKS, 0, False)):
+        matcher = GivenWalls([walls] * 20, agreements={area: Agreement(100, 90, 0) for area in areas})
+        matcher.work = event_work._MAX_WORK
+        search = begin_search(map_of(20), {90: np.zeros(3)}, 90, areas)
+        search = continue_search(search, matcher, map_of(20), matcher.event, marks=own)
+        assert matcher.searched == [first]
+        search = replace(
+            search, candidates=tuple(c._replace(mode=c.mode._replace(measured=sharp)) for c in search.candidates)
+        )
+        assert is_conclusive(search, 0.3, map_of(20), NO_CLUTTER, None, 0.8, own) is conclusive

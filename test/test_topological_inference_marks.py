@@ -14,9 +14,12 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.registration.area_to_area import MatchMode
+from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.saved_map.validation import check_record
 from hmt_slam_ros.sensors import MarkObservation
 from hmt_slam_ros.topological_inference.candidate_gating import Query, Transition
+from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
+from hmt_slam_ros.topological_inference.marked_places import NO_MARKS, MarkedPlaceFinder
 from hmt_slam_ros.topological_inference.marks import (
     Anchor,
     AreaMark,
@@ -266,3 +269,70 @@ def test_the_share_of_wrong_marks_bounds_the_gain(wrong_share):
     _, hybrid_map, memory = closing(deviation=12.0)
     evidence = MarkEvidence(with_changes(Configuration(), {"marks.wrong_share": wrong_share}))
     assert evidence.find_areas(hybrid_map, 2, query(), memory, {2})[0].mark_gain <= 1.0 / wrong_share - 1.0 + 1e-9
+
+
+LOST = {8: np.zeros(3), 9: np.array([0.5, 0.0, 0.0])}
+"""Keyframes of a lost robot, of which the second visits a mark."""
+
+
+def pose_candidate(area, pose):
+    """A match of the lost robot's keyframes."""
+    belief = PoseGaussian(np.array(pose), np.diag([0.02, 0.02, 0.01]) ** 2)
+    return PoseCandidate(area, MatchMode(belief, belief, 0.0), Agreement(100, 90, 0))
+
+
+def lost_memory(*earlier, pose):
+    """Visits before, and one of a lost robot whose second keyframe is at a pose of the world."""
+    return MarkMemory({"lift": (*earlier, visit(9, pose))})
+
+
+def test_a_mark_puts_a_lost_robot_where_it_was_visited():
+    hybrid_map = line(0.1)
+    # The robot is at the beginning of area 1, in which the mark was visited 1 m farther on.
+    memory = lost_memory(visit(3, line_pose(1, 1.0)), pose=line_pose(1, 0.5))
+    places = MarkedPlaceFinder(Configuration()).find(hybrid_map, LOST, 8, memory)
+    ((pose,),) = places.marks
+    assert pose.area == 1
+    np.testing.assert_allclose(pose.belief.mean, np.zeros(3), atol=1e-9)
+    flat = 0.8 / 3
+    found = [pose_candidate(1, (0.0, 0.0, 0.0)), pose_candidate(1, (0.8, 0.0, 0.0)), pose_candidate(2, (0.0, 0.0, 0.0))]
+    factors = np.exp(places.log_factors(hybrid_map, found, flat))
+    # In the frame of another area it is the same place.
+    beside = pose_candidate(0, (10.0, 0.0, 0.0))
+    np.testing.assert_allclose(factors, [WRONG + (1.0 - WRONG) / flat, WRONG, WRONG])
+    np.testing.assert_allclose(np.exp(places.log_factors(hybrid_map, [beside], flat)), factors[:1], rtol=0.2)
+    assert places.area_factors((0, 1), flat) == pytest.approx({0: WRONG, 1: factors[0]})
+    assert math.exp(places.log_unmarked) == pytest.approx(WRONG)
+
+
+def test_a_mark_that_was_not_visited_before_tells_a_lost_robot_nothing():
+    finder, hybrid_map = MarkedPlaceFinder(Configuration()), line(0.1)
+    own = visit(8, line_pose(1))
+    for memory in (MarkMemory(), lost_memory(pose=line_pose(1)), lost_memory(own, pose=line_pose(1))):
+        assert finder.find(hybrid_map, LOST, 8, memory) is NO_MARKS
+    assert NO_MARKS.log_factors(hybrid_map, [pose_candidate(1, (0.0, 0.0, 0.0))], 0.3) == [0.0]
+    assert NO_MARKS.log_unmarked == 0.0
+
+
+@pytest.mark.parametrize(("earlier", "share"), [(1, 1.0), (4, 0.25)])
+def test_a_mark_alone_is_as_sure_as_it_is_right_and_its_visits_share_that(earlier, share):
+    """Among any number of areas whose scans agree equally well."""
+    areas = 50
+    hybrid_map = line(0.1, areas)
+    visits = [visit(2 * area, line_pose(10)) for area in range(10, 10 + earlier)]
+    memory = lost_memory(*visits, pose=line_pose(10, 0.5))
+    poses = {200: np.zeros(3), 9: np.array([0.5, 0.0, 0.0])}
+    places = MarkedPlaceFinder(Configuration()).find(hybrid_map, poses, 200, memory)
+    candidates = [pose_candidate(area, (0.0, 0.0, 0.0)) for area in range(areas)]
+    flat = 0.8 / areas
+    weights = flat * np.exp(places.log_factors(hybrid_map, candidates, flat))
+    probabilities = weights / (weights.sum() + 0.2 * math.exp(places.log_unmarked))
+    assert probabilities[10] == pytest.approx((1.0 - WRONG) * share, abs=2e-3)
+    assert probabilities[40] < WRONG * flat * 1.01
+
+
+def test_the_visit_of_a_robot_that_is_lost_since_is_another_one():
+    memory = MarkMemory().after_event(3, [observation(line_pose(0))], Anchor(3, np.zeros(3)))
+    for since, count in ((0, 1), (3, 1), (4, 2)):
+        again = memory.after_event(5, [observation(line_pose(1))], Anchor(5, np.zeros(3)), since)
+        assert len(again.visits["lift"]) == count
