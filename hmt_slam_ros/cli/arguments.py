@@ -235,7 +235,9 @@ def _add_export_arguments(command: argparse.ArgumentParser) -> None:
 
 def _add_doctor_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("log", type=Path, nargs="?", metavar="LOG", help=_LOG)
-    command.add_argument("--live", action="store_true", help="listen to the running system instead")
+    command.add_argument(
+        "--live", action="store_true", help="listen to the running system instead, by default to the scans of its slam"
+    )
     command.add_argument("--seconds", type=float, default=10.0, metavar="S", help="how long to listen to it")
     command.add_argument("--json", action="store_true", help="print the findings as JSON")
     _add_scan_topics(command)
