@@ -60,7 +60,7 @@ MEASUREMENTS = {
     "recorded": "closures, starts and displacements on recorded logs, right or wrong",
     "disambiguation": "path until a robot is sure of its place, driving to where a look decides, or on",
     "marks": "error, closures and the path until the first one with marks that have names, some of them wrong",
-    "marked_awakening": "global localization in a saved map with marks that have names, some of them wrong",
+    "relocalization": "global localization in a saved map with marks that have names, some of them wrong",
     "merge": "maps of halves of a drive that are made apart and joined",
     "team": "robots that map at once from unknown starts: joins, right or wrong, and the path until then",
     "team_exploration": "exploration of an institute by two robots, and by one",

@@ -1,4 +1,4 @@
-"""Robot awakening with marks: global localization in a saved map by the number of marks, some of them wrong."""
+"""Relocalization with marks: global localization in a saved map by the number of marks, some of them wrong."""
 
 from __future__ import annotations
 
@@ -41,10 +41,11 @@ SEEDS, STARTS = 5, 6
 _DRAWS = 2080
 
 POLICY = (
-    f"As awakening, in the map of the first of two laps: {STARTS} starts in the second lap of each world, the same for "
-    "every number of marks. Marks are on the ceiling, evenly along a lap, and seen within 1.5 m, with a noise of 3 cm "
-    f"and 1 degree. Of the passes of one {100 * WRONG_SHARE:g} % have the name of another, in map and drive alike. The "
-    f"robot is localized rightly if it is so at the end of its path, within {FAR:g} m, and at no time wrongly."
+    f"As the measurement `awakening`, in the map of the first of two laps: {STARTS} starts in the second lap of each "
+    "world, the same for every number of marks. Marks are on the ceiling, evenly along a lap, and seen within 1.5 m, "
+    f"with a noise of 3 cm and 1 degree. Of the passes of one {100 * WRONG_SHARE:g} % have the name of another, in map "
+    f"and drive alike. The robot is localized rightly if it is so at the end of its path, within {FAR:g} m, and at no "
+    "time wrongly."
 )
 
 
@@ -60,10 +61,10 @@ class MarkedStarts(NamedTuple):
     starts: list[Awakening]
 
 
-def measure_marked_awakening(settings: Settings) -> Report:
+def measure_relocalization(settings: Settings) -> Report:
     """Map a lap of each world with no, few and many marks, and localize the robot in the next one."""
     seeds = chosen_seeds(settings, SEEDS)
-    report = Report("marked_awakening", "Global localization with marks", seeds=seeds)
+    report = Report("relocalization", "Global localization with marks", seeds=seeds)
     rows = []
     for family in chosen_families(settings, WORLDS, tuple(FAMILIES)):
         for marks in COUNTS:
