@@ -7,3 +7,7 @@ class HmtSlamError(Exception):
     The message is one sentence with the value at fault and the remedy. A command prints it on stderr and exits with
     status 2.
     """
+
+
+class EarlierSystemError(HmtSlamError):
+    """A system that was started earlier runs on the topics of a node, which gives way to it."""

@@ -179,20 +179,20 @@ _FURTHER_PUBLISHED: dict[str, tuple[str, ...]] = {
 """{node: topics that follow from no message of the process table}."""
 
 _FURTHER_SUBSCRIBED: dict[str, tuple[str, ...]] = {
-    "slam": (*_RESPONSES, "tf_static", "diagnostics"),
+    "slam": (*_RESPONSES, "tf_static"),
     "view": (
         *("pose", "hmt/pose", "hmt/topology", "hmt/alternatives", "hmt/evidence", "map", "hmt/keyframes"),
         *("hmt/keyframe_scans", "hmt/hypotheses", "hmt/closure_decisions", "hmt/is_localized", "hmt/entropy"),
         *("scan", "hmt/particles", "goal_pose", "hmt/ambiguity_goal", "pilot/place_estimate", "hmt/robot_status"),
-        *("hmt/landmarks", "explorer/rooms", "pilot/rooms", "diagnostics", "/team/placements"),
+        *("hmt/landmarks", "explorer/rooms", "pilot/rooms", "/team/placements"),
     ),
-    "robot": ("hmt/local_estimate", "hmt/tracking_reset", "diagnostics"),
+    "robot": ("hmt/local_estimate", "hmt/tracking_reset"),
     "team": ("hmt/reset_request", "rendezvous"),
     "explorer": ("hmt/reset_request", "tf_static", "odom"),
     "pilot": ("hmt/reset_request", "tf_static"),
-    "recorder": ("hmt/area_events", "hmt/robot_status", "diagnostics", "hmt/cost"),
+    "recorder": ("hmt/area_events", "hmt/robot_status", "hmt/cost"),
     "operator": (
-        *("map", "pose", "hmt/pose", "hmt/graph", "hmt/particles", "diagnostics", "hmt/incidents", "hmt/notices"),
+        *("map", "pose", "hmt/pose", "hmt/graph", "hmt/particles", "hmt/incidents", "hmt/notices"),
         *("scan", "tf", "tf_static", "explorer/task_result", "pilot/task_result", "pilot/place_estimate"),
         *("hmt/ambiguity", "hmt/ambiguity_goal", "hmt/path", "hmt/topology", "hmt/alternatives", "hmt/evidence"),
         *("hmt/task_feedback", "hmt/landmarks", "explorer/rooms", "pilot/rooms"),
@@ -256,7 +256,7 @@ def _publications(row: NodeRow) -> Iterator[str]:
 
 def _subscriptions(row: NodeRow) -> Iterator[str]:
     """Topics that a node subscribes to."""
-    yield from ("/clock", "/parameter_events")
+    yield from ("/clock", "/parameter_events", "diagnostics")
     for message in row.consumes:
         yield from _MESSAGE_TOPICS[message]
     if isinstance(row, ProcessRow) and row.name not in (COORDINATOR, TEAM.name):

@@ -199,9 +199,54 @@ def test_launch_file_describes_its_arguments(path):
     namespace = {}
     exec(compile(path.read_text(), str(path), "exec"), namespace)
     described = {argument.name for argument in namespace["generate_launch_description"]().get_launch_arguments()}
-    topics = {"scan_topic", "odom_topic", "clock_topic"}
+    topics = {"scan_topic", "scan_topics", "odom_topic", "clock_topic"}
     frames = {"map_frame", "odom_frame", "base_frame"}
     assert {"params_file", "namespace", "save_to", *topics, *frames} <= described
+
+
+NOTE_PARAMETERS = """#!{python}
+import json, sys
+from pathlib import Path
+import yaml
+found = {{}}
+for path in (sys.argv[k + 1] for k, word in enumerate(sys.argv) if word == "--params-file"):
+    for section in yaml.safe_load(Path(path).read_text()).values():
+        found |= section["ros__parameters"]
+(Path({folder!r}) / Path(sys.argv[0]).name).write_text(json.dumps(found))
+"""
+"""An executable that notes the parameters which launch gives it, the last ones in files."""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "of_robot"), [([], None), (["scan_topics:=front,rear"], "front,rear")], ids=["one", "several"]
+)
+def test_a_replay_reads_several_topics_and_maps_the_one_of_the_robot(setup_arguments, tmp_path, arguments, of_robot):
+    if find_spec("launch_ros") is None:
+        pytest.skip("launch_ros is not installed: it comes with a ROS installation, PyPI does not have it")
+    prefix, notes = tmp_path / "prefix", tmp_path / "notes"
+    notes.mkdir()
+    for folder, files in setup_arguments["data_files"]:
+        (prefix / folder).mkdir(parents=True, exist_ok=True)
+        for file in files:
+            (prefix / folder / Path(file).name).write_bytes((ROOT / file).read_bytes())
+    for node in NODES:
+        executable = prefix / "lib" / "hmt_slam_ros" / node
+        executable.write_text(NOTE_PARAMETERS.format(python=sys.executable, folder=str(notes)))
+        executable.chmod(0o755)
+    script = (
+        "import sys; from launch import LaunchDescription, LaunchService; from launch.actions import *;"
+        "from launch.launch_description_sources import PythonLaunchDescriptionSource as Source;"
+        "service = LaunchService(); words = [tuple(word.split(':=')) for word in sys.argv[2:]];"
+        "included = IncludeLaunchDescription(Source(sys.argv[1]), launch_arguments=words);"
+        "service.include_launch_description(LaunchDescription([included])); sys.exit(service.run())"
+    )
+    path = prefix / "share" / "hmt_slam_ros" / "launch" / "replay.launch.py"
+    environment = os.environ | {"ROS_LOG_DIR": str(tmp_path / "log")}
+    environment["AMENT_PREFIX_PATH"] = f"{prefix}:{os.environ.get('AMENT_PREFIX_PATH', '')}"
+    subprocess.run([sys.executable, "-c", script, path, *arguments], env=environment, check=True, timeout=60)
+    parameters = {path.name: json.loads(path.read_text()) for path in notes.iterdir()}
+    assert parameters["slam"]["sensors.scan_topics"] == "scan"
+    assert parameters["robot"].get("sensors.scan_topics") == of_robot
 
 
 def topics_of_the_nodes():

@@ -68,12 +68,14 @@ class NodeStatus(NamedTuple):
     :ivar level: 0 OK, 1 warning, 2 and more error.
     :ivar message: a sentence.
     :ivar state: lifecycle state of a managed node, else empty.
+    :ivar waits_for: the earlier system for whose end it waits, empty without.
     """
 
     name: str
     level: int
     message: str
     state: str = ""
+    waits_for: str = ""
 
 
 class FrameContradiction(NamedTuple):
@@ -99,7 +101,7 @@ class RunningSystem:
     :ivar topics: {name without namespace: topic}.
     :ivar nodes: names of all nodes in the doctor's namespace, but its own.
     :ivar sim_time_nodes: names of the nodes with use_sim_time.
-    :ivar diagnostics: last diagnostics of each node.
+    :ivar diagnostics: last diagnostics of each node of each system.
     :ivar clock_offsets: {topic: median by which its stamps precede the computer's clock on arrival, s}; empty where
         /clock is published.
     :ivar conflicting_transforms: {transform: number of stamps for which two sources published different values}.
@@ -200,11 +202,12 @@ def _check_states(running: RunningSystem) -> Iterator[Finding]:
 
 
 def _nodes_in_state(running: RunningSystem, state: str) -> list[str]:
-    """Names of our nodes in a lifecycle state, with their namespaces, but those that compile."""
+    """Names of our nodes in a lifecycle state, with their namespaces, but those that compile or wait for a system."""
     return sorted(
         status.name
         for status in running.diagnostics
-        if status.state == state and status.name.rpartition("/")[2] in OUR_NODES and not _is_compiling(status)
+        if status.state == state and status.name.rpartition("/")[2] in OUR_NODES
+        if not _is_compiling(status) and not status.waits_for
     )
 
 

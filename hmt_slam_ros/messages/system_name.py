@@ -65,6 +65,10 @@ class SystemName:
         """Take note that another system sent a document."""
         self._other, self._other_at = name or "without a name", time.monotonic()
 
+    def forget_other(self) -> None:
+        """Take note that the other system has ended."""
+        self._other_at = -_MEMORY
+
     @property
     def other(self) -> str:
         """The other system that sent a document lately, empty without."""

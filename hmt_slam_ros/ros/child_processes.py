@@ -12,6 +12,8 @@ PARENT_VARIABLE = "HMT_SLAM_PARENT"
 """Environment variable with the pid of the process that started this one, and with which it ends."""
 FAULT = 2
 """Exit status for a fault."""
+EARLIER_SYSTEM = 3
+"""Exit status of a node that gave way to a system that was started earlier."""
 MAX_RESTARTS, _RESTART_WINDOW = 3, 60.0
 """Restarts of a node within this many seconds after which it is given up."""
 

@@ -31,8 +31,12 @@ STATE, ACTIVE = "state", "active"
 """Key of the lifecycle state in /diagnostics, and its value for an active node."""
 STARTED = "started at"
 """Key of the time at which a node started, by which two nodes of one name differ."""
+SYSTEM_STARTED = "system started at"
+"""Key of the earliest start of a node of its system that a node knows, by which two systems differ."""
 SYSTEM, SECOND_SYSTEM = "system", "second system"
 """Keys of the name of a node's system in /diagnostics, and of another system that speaks on its topics."""
+WAITS_FOR = "waits for"
+"""Key of the earlier system for whose end a node waits."""
 KERNELS = "kernels"
 """Key of the kernels of a node in /diagnostics: how long they are compiled yet, or how many are loaded."""
 LOADING = ("compiling", "loading")
@@ -66,13 +70,15 @@ class NodeDiagnostics:
     :ivar progress: describes what has to be done before the node can process messages; empty without.
     :ivar system: the system that the node belongs to.
     :ivar started: time at which the node started, in ISO 8601.
+    :ivar system_started: the earliest such time of a node of its system.
     :ivar crowded_topic: a topic with more publishers than one system has, and their number; empty without.
     :ivar steady_clock: clock for timers that run while simulated time stands still.
     """
 
     def __init__(self, node: Node, system: SystemName) -> None:
         self._node, self.system, self.crowded_topic = node, system, ""
-        self.started = datetime.now(UTC).isoformat(timespec="milliseconds")
+        self.started = datetime.now(UTC).isoformat(timespec="microseconds")
+        self.system_started: Callable[[], str] = lambda: self.started
         self.kernels: Callable[[], str] = str
         self.progress: Callable[[], str] = str
         self.clear()
@@ -98,9 +104,12 @@ class NodeDiagnostics:
         self._costs: list[tuple[int, float]] = []
         self._handled, self._busy_seconds, self._longest = 0, 0.0, 0.0
 
-    def warn(self, sentence: str) -> None:
-        """Record and log a fault that the node survives; a repeated sentence is logged once."""
-        self._record_fault(sentence, DiagnosticStatus.WARN, WARNING_LIFETIME)
+    def warn(self, sentence: str, lifetime: float | None = None) -> None:
+        """Record and log a fault that the node survives; a repeated sentence is logged once.
+
+        :param lifetime: time for which it holds, s; None for :data:`WARNING_LIFETIME`.
+        """
+        self._record_fault(sentence, DiagnosticStatus.WARN, WARNING_LIFETIME if lifetime is None else lifetime)
 
     def refuse(self, topic: str, fault: HmtSlamError) -> None:
         """Count a message that is left out, and log the first one of each cause.
@@ -179,6 +188,7 @@ class NodeDiagnostics:
             "memory": f"{current_rss() / 1e6:.0f} MB",
             "peak memory": f"{peak_rss() / 1e6:.0f} MB",
             STARTED: self.started,
+            SYSTEM_STARTED: self.system_started(),
             "last error": self._error,
             "last error at": self._error_at,
         }

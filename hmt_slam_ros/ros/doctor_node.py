@@ -42,7 +42,7 @@ from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import running_stamps
 from hmt_slam_ros.process_table import COORDINATOR, producer, topic_of
 from hmt_slam_ros.ros import conversions, topics
-from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, STATE, SYSTEM, is_of_other_namespace
+from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, STATE, SYSTEM, WAITS_FOR, is_of_other_namespace
 from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, ODOM_FRAME
 from hmt_slam_ros.ros.topics import DIAGNOSTICS, TFMessage
 from hmt_slam_ros.sensors import Odometry, Scan
@@ -122,7 +122,7 @@ class DoctorNode(Node):
         self._frame_tree, self._transforms = FrameTree(), TransformCollector()
         self._last_transforms: dict[tuple[str, str], tuple[int, bytes]] = {}
         self._conflicting_transforms: dict[str, int] = defaultdict(int)
-        self._node_statuses: dict[str, NodeStatus] = {}
+        self._node_statuses: dict[tuple[str, str], NodeStatus] = {}
         self._systems: set[str] = set()
         self._parameter_clients: dict[str, Client] = {}
         self._parameter_futures: dict[str, dict[str, Future]] = {}
@@ -209,10 +209,12 @@ class DoctorNode(Node):
                 continue
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
             values = {entry.key: entry.value for entry in status.values}
-            state = values.get(STATE, "")
-            if status.hardware_id == HARDWARE_ID and values.get(SYSTEM):
-                self._systems.add(values[SYSTEM])
-            self._node_statuses[status.name] = NodeStatus(status.name, level, status.message, state)
+            state, system = values.get(STATE, ""), values.get(SYSTEM, "")
+            if status.hardware_id == HARDWARE_ID and system:
+                self._systems.add(system)
+            self._node_statuses[status.name, system] = NodeStatus(
+                status.name, level, status.message, state, values.get(WAITS_FOR, "")
+            )
 
     def _on_static_transforms(self, message: Any) -> None:  # noqa: ANN401  a TFMessage, where there is one
         self._counts[running.TF_STATIC] += 1

@@ -1,4 +1,4 @@
-"""Start and end of a node: exit status 0 after a signal, one sentence and status 2 for a fault, never a traceback.
+"""Start and end of a node: exit status 0 after a signal, one sentence and another status for a fault, no traceback.
 
 Fast DDS 2.14 may hang in the destruction of a participant while others leave: ``DomainParticipant::set_listener``
 waits for a mutex that is never released. rclpy calls it with the interpreter locked, so no Python thread can help. A
@@ -24,8 +24,8 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
-from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.ros.child_processes import FAULT, PARENT_VARIABLE
+from hmt_slam_ros.errors import EarlierSystemError, HmtSlamError
+from hmt_slam_ros.ros.child_processes import EARLIER_SYSTEM, FAULT, PARENT_VARIABLE
 
 _SIGEV_THREAD = 2  # <signal.h>
 _CLOCK_MONOTONIC = 1  # <time.h>
@@ -191,9 +191,10 @@ def _run_node(
         return 0
     except HmtSlamError as error:
         # An unfinished node is destroyed with the exception, and its participant with it.
-        force_exit_after(_SHUTDOWN_TIMEOUT, FAULT)
+        status = EARLIER_SYSTEM if isinstance(error, EarlierSystemError) else FAULT
+        force_exit_after(_SHUTDOWN_TIMEOUT, status)
         print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr, flush=True)
-        return FAULT
+        return status
     return 0
 
 

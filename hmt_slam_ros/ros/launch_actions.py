@@ -7,12 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from launch import LaunchContext, Substitution
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription, OpaqueFunction, Shutdown
+from launch.events.process import ProcessExited
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, LaunchLogDir, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
+
+from hmt_slam_ros.ros.child_processes import EARLIER_SYSTEM
 
 PACKAGE = "hmt_slam_ros"
 RESPAWN = {"respawn": True, "respawn_delay": 1.0, "respawn_max_retries": 3}
@@ -28,6 +31,11 @@ TOPICS = {
     "clock_topic": ("/clock", "Topic of the time, for use_sim_time."),
 }
 """{argument: topic that is remapped, and description}."""
+
+SCAN_TOPICS = "scan_topics"
+"""Argument with the topics of several lasers, which is the parameter ``sensors.scan_topics`` of the nodes."""
+_TOPIC_OF_ROBOT = "scan"
+"""Topic on which the robot node publishes the scans of all lasers, in the order of their stamps."""
 
 
 class LaunchName(Substitution):
@@ -64,6 +72,12 @@ def common_arguments() -> list[DeclareLaunchArgument]:
         ),
         DeclareLaunchArgument("save_to", default_value="hmt_map", description="Folder for the service slam/save."),
         *(DeclareLaunchArgument(name, default_value=topic, description=text) for name, (topic, text) in TOPICS.items()),
+        DeclareLaunchArgument(
+            SCAN_TOPICS,
+            default_value="",
+            description="Topics of the scans of several lasers, live or in a bag, separated by commas; empty for what "
+            "the YAML file says.",
+        ),
         *(DeclareLaunchArgument(name, default_value="", description=text) for name, text in FRAMES.items()),
         switch("view", "false", "Whether the live page is served."),
     ]
@@ -88,8 +102,13 @@ def node(executable: str, parameters: dict[str, Any], **options: Any) -> OpaqueF
     """Node of this package, with the parameter file, topics, frames, the name of the system and further parameters."""
 
     def make(context: LaunchContext) -> list[Node]:
-        frames = {name: value(name, str) for name in FRAMES if LaunchConfiguration(name).perform(context)}
-        named = {"system": value("system", str), **frames, **parameters}
+        arguments = {**{name: name for name in FRAMES}, SCAN_TOPICS: f"sensors.{SCAN_TOPICS}"}
+        given = {
+            parameter: value(name, str)
+            for name, parameter in arguments.items()
+            if LaunchConfiguration(name).perform(context)
+        }
+        named = {"system": value("system", str), **given, **parameters}
         return [
             Node(
                 package=PACKAGE,
@@ -98,11 +117,19 @@ def node(executable: str, parameters: dict[str, Any], **options: Any) -> OpaqueF
                 parameters=[LaunchConfiguration("params_file"), named],
                 remappings=topic_remappings(),
                 output="screen",
+                on_exit=end_beside_earlier_system,
                 **options,
             )
         ]
 
     return OpaqueFunction(function=make)
+
+
+def end_beside_earlier_system(event: ProcessExited, _context: LaunchContext) -> list[Shutdown]:
+    """End the launch where one of its nodes gave way to a system that was started earlier."""
+    if event.returncode != EARLIER_SYSTEM:
+        return []
+    return [Shutdown(reason="a system that was started earlier runs on these topics, as the nodes said")]
 
 
 def topic_remappings() -> list[tuple[str, LaunchConfiguration]]:
@@ -120,18 +147,22 @@ def robot(log: str, **parameters: str) -> OpaqueFunction:
     return node("robot", own | {f"robot.{name}": setting for name, setting in parameters.items()})
 
 
-def mapping(*passed: str, **arguments: str) -> IncludeLaunchDescription:
-    """The processes in simulated time, by the included ``mapping.launch.py``.
+def mapping(*passed: str, **arguments: str) -> GroupAction:
+    """The processes beside a robot node, in simulated time, by the included ``mapping.launch.py``.
+
+    In a group, as the arguments of an included file would otherwise hold for the robot, too.
 
     :param passed: names of arguments to pass on, beside the common ones.
     :param arguments: further arguments.
     """
     names = (*(argument.name for argument in common_arguments()), *passed)
-    return IncludeLaunchDescription(
+    included = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(shared_path("launch", "mapping.launch.py")),
         launch_arguments={
             "use_sim_time": "true",
             **{name: LaunchConfiguration(name) for name in names},
+            SCAN_TOPICS: _TOPIC_OF_ROBOT,
             **arguments,
         }.items(),
     )
+    return GroupAction([included])

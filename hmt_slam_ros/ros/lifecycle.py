@@ -25,9 +25,12 @@ from hmt_slam_ros.messages.system_name import SystemName
 from hmt_slam_ros.ros.diagnostics import STATE, NodeDiagnostics
 from hmt_slam_ros.ros.kernel_thread import KernelThread
 from hmt_slam_ros.ros.parameters import ConfiguredNode
+from hmt_slam_ros.ros.precedence_monitor import PrecedenceMonitor
 
 _POLL = 0.02
 """Time between two checks whether the kernels are loaded, s."""
+_PRECEDENCE_POLL = 0.5
+"""Time between two checks whether an earlier system runs, s."""
 _AUTOSTART = ParameterDescriptor(
     description="Whether the node configures and activates itself; otherwise it waits for a lifecycle manager.",
     read_only=True,
@@ -41,6 +44,7 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
     :ivar is_configured: whether the node is inactive or active.
     :ivar is_active: whether the node is active.
     :ivar kernels: the thread that loads the kernels, started by ``configure``.
+    :ivar precedence: whether a system that was started earlier runs on the topics of the node.
     """
 
     def __init__(self, name: str) -> None:
@@ -60,6 +64,8 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         self._autostart = bool(self.declare_parameter("autostart", True, _AUTOSTART).value)
         self.diagnostics = NodeDiagnostics(self, self.system)
         self.diagnostics.kernels, self.diagnostics.progress = self.kernels.describe, lambda: self.kernels.progress
+        self.precedence = PrecedenceMonitor(self, self.diagnostics)
+        self.create_timer(_PRECEDENCE_POLL, self._follow_precedence, clock=self.diagnostics.steady_clock)
         # So that other requests are answered while one waits for the kernels; all of them run in one thread.
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
         self._change_state = self._service_change_state.callback
@@ -134,12 +140,32 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
 
     def _check_kernels(self) -> None:
         """Go on with the startup, and answer who waits, where the kernels are loaded."""
-        if not self.kernels.is_done:
-            return
-        self._stop_loading()
-        if self._activates_itself and self.is_configured and not self.is_active:
+        if self.kernels.is_done:
+            self._stop_loading()
+            self._follow_precedence()
+
+    def _follow_precedence(self) -> None:
+        """Activate the node where that is due; halt it while an earlier system runs, and at last end it.
+
+        :raises HmtSlamError: where the node is to end.
+        """
+        if self.precedence.check():
+            if self.is_active:
+                self._make_startup_transition(self.trigger_deactivate)
+                self._activates_itself = True
+            if self._autostart:
+                self.precedence.check_patience()
+        elif self._is_activation_due and (self.continues_killed_node or not self.precedence.is_unsure):
             self._make_startup_transition(self.trigger_activate)
-        self._activates_itself = False
+
+    @property
+    def _is_activation_due(self) -> bool:
+        return self._activates_itself and self.is_configured and not self.is_active and self._loading_timer is None
+
+    @property
+    def continues_killed_node(self) -> bool:
+        """Whether the node goes on where a killed one of its name was."""
+        return False
 
     def _stop_loading(self) -> None:
         self.kernels.stop()
@@ -152,7 +178,7 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         """Destroy all that was made after the constructor."""
         self._stop_loading()
         self.clean_up_node()
-        self.is_configured = self.is_active = False
+        self.is_configured = self.is_active = self._activates_itself = False
         self._destroy_configured_entities()
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
@@ -188,7 +214,8 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode):
         self._load_kernels()
 
     def _activate(self) -> None:
-        self.is_active = True
+        self.precedence.check_first()
+        self.is_active, self._activates_itself = True, False
         self.activate_node()
 
     def _deactivate(self) -> None:

@@ -19,7 +19,7 @@ from rclpy.signals import uninstall_signal_handlers
 
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import as_flat
-from hmt_slam_ros.errors import HmtSlamError
+from hmt_slam_ros.errors import EarlierSystemError, HmtSlamError
 from hmt_slam_ros.messages.gate import ChainGate
 from hmt_slam_ros.messages.messages import Message, Notice, RealTimePose, TrackingReset
 from hmt_slam_ros.messages.replica import FIRST_HYPOTHESIS
@@ -96,25 +96,35 @@ class ProcessNode(ParticipantNode):
 
         With ``save_on_shutdown`` rclpy's signal handlers are replaced, as they would end all communication at once.
 
-        :raises HmtSlamError: where the node cannot start.
+        :raises HmtSlamError: where the node cannot start, or gives way to an earlier system.
         """
         self.enter_startup_states()
         has_ended = False
         try:
             if self.save_on_shutdown and rclpy.ok():
-                first_signal = _FirstSignal()
-                spin_until(
-                    self,
-                    lambda: (
-                        first_signal.has_timed_out or (first_signal.received_at is not None and self.poll_final_save())
-                    ),
-                )
+                self._spin_until_saved()
             else:
                 spin_until(self)
             has_ended = True
+        except EarlierSystemError:
+            has_ended = True
+            raise
         finally:
             if has_ended or not rclpy.ok():
                 self.discard_recovery()
+
+    def _spin_until_saved(self) -> None:
+        first_signal = _FirstSignal()
+
+        def is_done() -> bool:
+            return first_signal.has_timed_out or (first_signal.received_at is not None and self.poll_final_save())
+
+        try:
+            spin_until(self, is_done)
+        except EarlierSystemError:
+            first_signal(signal.SIGINT, None)
+            spin_until(self, is_done)
+            raise
 
     @property
     def startup_states(self) -> tuple[bool, bool]:
@@ -123,6 +133,11 @@ class ProcessNode(ParticipantNode):
         if recovered is None:
             return configure, activate
         return True, activate if recovered.was_active is None else recovered.was_active
+
+    @property
+    def continues_killed_node(self) -> bool:
+        """Whether the journal of a killed node was found."""
+        return self.recovery.recovered_state is not None
 
     def configure_node(self) -> None:
         """Make the process, inbox and outbox.

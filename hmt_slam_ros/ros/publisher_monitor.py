@@ -1,18 +1,15 @@
-"""Detection of a second system by its diagnostics and by publishers, also where its messages have no name."""
+"""Detection of a second system by its publishers, also where its messages have no name."""
 
 from __future__ import annotations
 
 import time
 
-from diagnostic_msgs.msg import DiagnosticArray
-
 from hmt_slam_ros.messages.routing import message_types
 from hmt_slam_ros.messages.system_name import REMEDY
-from hmt_slam_ros.process_table import COORDINATOR, process_row
-from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.diagnostics import PERIOD, STARTED, SYSTEM, NodeDiagnostics
+from hmt_slam_ros.process_table import process_row
+from hmt_slam_ros.ros.diagnostics import PERIOD, NodeDiagnostics
 from hmt_slam_ros.ros.guarded_node import GuardedNode
-from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAMES, ODOM, POSE
+from hmt_slam_ros.ros.topics import DOCUMENTS, KEYFRAMES, ODOM, POSE
 from hmt_slam_ros.sensors import Odometry
 
 _PATIENCE = 30.0
@@ -20,7 +17,7 @@ _PATIENCE = 30.0
 
 
 class PublisherMonitor:
-    """Checks that topics of a process have one publisher, and slam that no other node has its name."""
+    """Checks that topics of a process have one publisher."""
 
     def __init__(self, node: GuardedNode, diagnostics: NodeDiagnostics, process: str) -> None:
         """:param process: name of the process."""
@@ -34,22 +31,6 @@ class PublisherMonitor:
         self._node, self._diagnostics = node, diagnostics
         self._crowded_since: dict[str, float] = {}
         node.create_timer(PERIOD, self._check, clock=diagnostics.steady_clock)
-        if process == COORDINATOR:
-            node.create_subscription(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, topics.STREAM)
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        """Take note of a node of the same name that started at another time."""
-        for status in message.status:
-            if status.name != self._node.get_fully_qualified_name():
-                continue
-            values = {entry.key: entry.value for entry in status.values}
-            if values.get(STARTED, self._diagnostics.started) != self._diagnostics.started:
-                self._note_other(values.get(SYSTEM, ""))
-
-    def _note_other(self, name: str) -> None:
-        self._diagnostics.system.note_other(name)
-        if self._diagnostics.is_new_cause(DIAGNOSTICS, name):
-            self._diagnostics.warn(self._diagnostics.second_system_text)
 
     def _check(self) -> None:
         now, crowded = time.monotonic(), ""

@@ -43,6 +43,7 @@ from hmt_slam_ros.ros.diagnostics import HARDWARE_ID, KERNELS, LOADING, NodeDiag
 from hmt_slam_ros.ros.message_io import Inbox
 from hmt_slam_ros.ros.parameters import ConfiguredNode, declare_frame
 from hmt_slam_ros.ros.player import Player
+from hmt_slam_ros.ros.precedence_monitor import PrecedenceMonitor
 from hmt_slam_ros.ros.topics import (
     CLOCK,
     CMD_VEL,
@@ -152,6 +153,7 @@ class RobotNode(ConfiguredNode):
         self._base_frame = declare_frame(self, "base", "base_link")
         self._laser_frame = declare_frame(self, "laser", "laser")
         self.diagnostics = NodeDiagnostics(self, self.system)
+        self._precedence = PrecedenceMonitor(self, self.diagnostics)
         self._driven_robot: DrivenRobotSource | None = None
         self._log = self._open_log()
         self._player = Player(self._log, self._settings, self.configuration.motion.patience)
@@ -217,7 +219,14 @@ class RobotNode(ConfiguredNode):
             executor.shutdown()
 
     def _step(self) -> float:
-        """Send what is due; return the time until the next step, s."""
+        """Send what is due, unless an earlier system runs; return the time until the next step, s.
+
+        :raises HmtSlamError: where that does not end, or the subscribers do not come.
+        """
+        if self._precedence.check():
+            self._precedence.check_patience()
+            self._started_at = self._last_progress = time.monotonic()
+            return _LONGEST_WAIT
         if self._state == "waiting":
             self._await_subscribers()
             return _LONGEST_WAIT
@@ -231,7 +240,12 @@ class RobotNode(ConfiguredNode):
 
     @property
     def _is_answered(self) -> bool:
-        """Whether a subscriber of the scans publishes estimates, as a recorder or RViz does not."""
+        """Whether a subscriber of the scans publishes estimates, as a recorder or RViz does not.
+
+        A robot with the name of a system waits for slam of that system, beside which there may be another one.
+        """
+        if self.system.name and not self._precedence.knows_coordinator:
+            return False
         subscribers, publishers = (
             {(endpoint.node_namespace, endpoint.node_name) for endpoint in endpoints}
             for endpoints in (
@@ -257,7 +271,7 @@ class RobotNode(ConfiguredNode):
         ]
         if settings.flow_control and settings.scan_listeners and not missing and not self._is_answered:
             missing = [SCAN]
-        if not missing and not self._is_awaiting_kernels:
+        if not missing and not self._is_awaiting_kernels and not self._precedence.is_unsure:
             self._state, self._last_progress = "playing", time.monotonic()
             if self._driven_robot is None:
                 sentence = f"replaying {self._log.name}: {self._log.scan_count} scans"

@@ -100,7 +100,7 @@ class _ForkedNodes:
             self._fork(name)
         else:
             _say(f"the node {name} ended with status {status}, and all others with it")
-            self._status = FAULT
+            self._status = status if status > 0 else FAULT
             self._stop(signal.SIGINT)
 
     def _on_signal(self, number: int, _frame: object) -> None:

@@ -35,6 +35,9 @@ _WARN = 1
 _SECOND_SYSTEM = "second system"
 """Name of the value by which a node reports another system on its topics."""
 
+_WAITS_FOR = "waits for"
+"""Name of the value by which a node says that it waits for the end of an earlier system."""
+
 _KERNELS = "kernels"
 """Name of the value that describes the kernels of a node."""
 
@@ -120,6 +123,7 @@ class SystemHealth:
             self._silent_nodes_verdict(now),
             diagnostics.get("fault"),
             self._compiling_nodes_verdict(),
+            self._waiting_nodes_verdict(),
             self._inactive_nodes_verdict(),
             self._second_system_verdict(),
             self._pose_verdict(now),
@@ -166,6 +170,13 @@ class SystemHealth:
         text = self.nodes[max(left, key=lambda name: left[name])].values[_KERNELS]
         advice = "That is so once on a computer. At the installation hmt_slam compile does it."
         return _verdict("waiting", f"{_join_names(sorted(left))}: {text}.", advice)
+
+    def _waiting_nodes_verdict(self) -> dict[str, str] | None:
+        """The verdict on nodes that wait for the end of an earlier system."""
+        waiting = next((node for node in self.nodes.values() if _WAITS_FOR in node.values), None)
+        if waiting is None:
+            return None
+        return _verdict("attention", "This system waits for the end of an earlier one.", waiting.message)
 
     def _inactive_nodes_verdict(self) -> dict[str, str] | None:
         for name in self.nodes:
