@@ -90,17 +90,14 @@ def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listene
     assert_stands_beside_a_silent_laser(listener, nodes, reports, truths)
     second.is_on = True
     listener.until(lambda: outcomes, alive=nodes)
-    reported = [decode(message.data, TaskFeedback) for message in feedback]
-    assert {each.task for each in reported} == {"explore"}
-    assert max(each.distance_remaining or 0.0 for each in reported) > 0.5
+    assert_feedback_is_of_exploring(feedback)
     answer = listener.call(Trigger, "explorer/cancel", Trigger.Request())
     assert (answer.success, answer.message) == (False, "there is no task to cancel")
     explored = "explore: all is known that can be reached; 0 places were given up"
     assert outcomes[0].data == explored
     path = np.array([pose_from_message(message.pose)[:2] for message in truths])
     assert np.hypot(*(path - (2.0, 3.0)).T).min() < 2.0
-    assert goals
-    assert goals[0].header.frame_id == "map"
+    assert goals and goals[0].header.frame_id == "map"
     goals_ = listener.node.create_publisher(String, "explorer/task", 10)
     poses = listener.node.create_publisher(PoseStamped, "explorer/goal", 10)
     listener.until(lambda: goals_.get_subscription_count() and poses.get_subscription_count())
@@ -121,8 +118,7 @@ def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listene
     pose = pose_message(se2.between(np.array([1.0, 0.0, 0.0]), goal))
     poses.publish(PoseStamped(header=Header(frame_id="area_0"), pose=pose))
     listener.until(lambda: len(outcomes) > 4, alive=nodes)
-    x, y = pose.position.x, pose.position.y
-    assert outcomes[4].data == f"navigate to ({x:.2f}, {y:.2f}): the robot is there"
+    assert outcomes[4].data == f"navigate to ({pose.position.x:.2f}, {pose.position.y:.2f}): the robot is there"
     np.testing.assert_allclose(pose_from_message(truths[-1].pose), goal, atol=0.25)
 
     *others, explorer, robot = nodes
@@ -134,6 +130,12 @@ def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listene
     again = start("explorer", laser_pose="[0.0,0.0,0.0]")
     listener.until(lambda: len(outcomes) > received, alive=[*others, robot, again])
     assert {outcome.data for outcome in outcomes[5:]} == {explored}
+
+
+def assert_feedback_is_of_exploring(messages):
+    reported = [decode(message.data, TaskFeedback) for message in messages]
+    assert {each.task for each in reported} == {"explore"}
+    assert max(each.distance_remaining or 0.0 for each in reported) > 0.5
 
 
 def assert_room_is_the_arm(message):

@@ -118,7 +118,7 @@ class PlacementSearch:
         return _WindowSearch(search, known, excluded, max(0, len(unexamined) - _REGIONS))
 
     @property
-    def searched(self) -> int:
+    def searched_count(self) -> int:
         """Number of areas in which windows were searched, those of all windows together."""
         searches = [own.search for own in self._searches.values() if own.search is not None]
         return sum(search.areas - len(search.unexamined) for search in searches)

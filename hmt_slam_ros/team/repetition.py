@@ -43,7 +43,7 @@ class RepetitionTest:
     """
 
     def __init__(self, configuration: Configuration) -> None:
-        self._search = PlacementSearch(configuration, _Surroundings)
+        self._search = PlacementSearch(configuration, _OverlappingAreas)
         self.log_ratio, self.is_done = 0.0, True
 
     def update(self, component: Component, shift: Shift | None = None) -> None:
@@ -70,7 +70,7 @@ def add_repetition(component: Component, configuration: Configuration) -> Compon
     return replace(component, log_repetition=test.log_ratio)
 
 
-class _Surroundings:
+class _OverlappingAreas:
     """The areas around a window of a map and its copy, where it fits since it lies there."""
 
     def __init__(self, pair: ComponentPair) -> None:
@@ -91,6 +91,6 @@ class _Surroundings:
 def _log_ratio(search: PlacementSearch) -> float:
     possible = len(search.pair.known) * max(1, len(search.windows))
     ratios = [min(sum(each.evidence), MAX_LOG_REPETITION) for each in search.distribution().placements]
-    mean = (float(np.exp(ratios).sum()) + possible - search.searched) / possible
+    mean = (float(np.exp(ratios).sum()) + possible - search.searched_count) / possible
     log_ratio = math.log(_BEYOND + (1.0 - _BEYOND) * mean)
     return round(min(log_ratio, MAX_LOG_REPETITION), _DIGITS)
