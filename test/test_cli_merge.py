@@ -82,6 +82,7 @@ def test_maps_are_joined_where_they_show_the_same_ground(maps, tmp_path, capsys)
     assert len(first["placements"][0]["agreeing"]) > 3
 
 
+@pytest.mark.long
 def test_a_merged_map_is_one_map_of_the_next_merge(maps, tmp_path, capsys):
     out = tmp_path / "out"
     assert merge(maps / "one", maps / "two", "--out", out) == 0

@@ -122,7 +122,7 @@ def test_the_path_goes_through_the_middle_of_a_door_and_not_through_a_gap_that_i
         assert abs(place[1]) < 0.15 or not through
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_it_reaches_goals_in_floors_with_people_without_contact(seed):
     legs = list(drive_goals(scenario_of("institute", seed, "360°"), 17))
     assert len(legs) == 17

@@ -113,11 +113,13 @@ def test_a_node_says_it_once_and_sends_the_time_left_as_no_alarm(tmp_path, liste
     for times in (1, 0):
         reported = listener.subscribe(DiagnosticArray, DIAGNOSTICS, STREAM)
         slam = start("slam")
-        start("robot", log=log, robot__rate=0.0, robot__flow_control=False)
+        robot = start("robot", log=log, robot__rate=0.0, robot__flow_control=False)
         # The first scan is estimated, and the others wait for topology: no kernel is left to a start that is quicker.
         listener.until(lambda: early_estimates() == scans - 1, seconds=120.0, alive=[slam])
         slam.send_signal(signal.SIGINT)
         assert slam.communicate(timeout=60.0)[1].count("compiling kernels") == times
+        robot.send_signal(signal.SIGINT)
+        robot.communicate(timeout=60.0)
         assert {status.level for status in statuses()} <= {DiagnosticStatus.OK}
         progress = [status.message for status in statuses() if status.message.startswith("compiling kernels, ")]
         assert bool(progress) == bool(times)

@@ -78,6 +78,8 @@ def make_tsbi():
         find_unlinked_overlap=lambda *_: None,
         leads_elsewhere=lambda _parent: False,
         statements=SimpleNamespace(due_pair=lambda _parent: None),
+        options=tsbi._options,
+        is_marked=lambda _keyframes, _before: False,
     )
     return tsbi
 
