@@ -128,8 +128,10 @@ def test_scans_are_missing_from_the_kidnapping_on():
 
 @pytest.mark.parametrize(
     ("world", "kind", "seed"),
-    [("busy", "known", 1000), ("office", "unknown", 8)],
-    ids=["among people", "where little but passed walls contradicts, keyframe by keyframe"],
+    [
+        pytest.param("busy", "known", 1000, marks=pytest.mark.long, id="among people"),
+        pytest.param("office", "unknown", 8, id="where little but passed walls contradicts, keyframe by keyframe"),
+    ],
 )
 def test_a_kidnapping_is_detected_and_the_robot_relocalized(world, kind, seed):
     found = drive_kidnapped(draw_drive(world, kind, seed))

@@ -152,6 +152,7 @@ def test_rooms_have_names_and_the_robot_goes_there() -> None:
     assert own.robot.contacts == 0
 
 
+@pytest.mark.long
 def test_backtracking_goes_along_its_own_path_until_stopped() -> None:
     own = explore(1)
     at = len(path_of(own))

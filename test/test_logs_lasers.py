@@ -51,6 +51,7 @@ def test_topics_that_a_bag_lacks_are_named(tmp_path):
         load_configuration(settings=["sensors.scan_topics= , "])
 
 
+@pytest.mark.long
 def test_a_robot_with_two_lasers_maps_as_well_as_with_one(tmp_path, capsys):
     bag, out = bag_with_two_topics(open_log(WORLD, duration=60.0), tmp_path), tmp_path / "out"
     assert main(["map", str(bag), "--out", str(out), "--set", f"sensors.scan_topics={TOPICS}", "--jobs", "1"]) == 0

@@ -130,6 +130,7 @@ def test_rtl_that_is_killed_goes_on_with_the_pose_and_the_parameters_that_it_had
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_a_process_that_was_dead_while_the_others_restarted_restarts_too(corridor, listener, start, tmp_path):
     log, out = corridor
     parameters = {"start_from": out, "start_lost": False, "recovery": tmp_path}
