@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 
 from benchmark.disambiguation import (
     DISAMBIGUATING,
@@ -99,6 +100,7 @@ def test_the_measurements_of_the_driven_robot_continue_those_of_the_route():
     np.testing.assert_allclose(se2.between(odometry, second.measurement.pose), np.zeros(3), atol=0.05)
 
 
+@pytest.mark.long
 def test_from_a_question_in_twin_rooms_the_run_goes_on_in_three_ways():
     found = find_question_drives(("twins", 51))
     assert found is not None

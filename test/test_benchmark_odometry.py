@@ -82,6 +82,7 @@ def test_a_map_of_the_right_topology_is_distinguished_from_wrong_ones():
     assert not TopologyVerdict(None).is_right
 
 
+@pytest.mark.long
 def test_runs_with_degraded_odometry_are_scored_and_a_failed_one_is_wrong(tmp_path):
     """Real runs of the beginning of the bundled log; the path of the first is taken for the truth."""
     with open_logs([BUNDLED]) as (bundled,):

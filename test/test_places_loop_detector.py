@@ -87,6 +87,7 @@ def test_a_loop_that_was_mapped_twice_is_proposed_with_the_places_that_are_one(t
     assert found >= 11
 
 
+@pytest.mark.long
 def test_no_loop_is_proposed_where_there_is_none():
     for seed in range(40):
         random = np.random.default_rng(seed)

@@ -160,10 +160,10 @@ def test_a_killed_node_that_is_started_again_and_a_node_in_another_namespace_are
     killed = start("slam", "-p", "system:=one")
     other = start("slam", "-p", "system:=two", "-r", "__ns:=/robot")
     listener.until(lambda: values_of(reports, "one", "slam").get("state") == "active", alive=[killed, other])
+    listener.until(lambda: listener.node.get_node_names_and_namespaces().count(("slam", "/")) == 1)
     killed.kill()
     killed.communicate()
     del reports[:]
-    assert listener.node.get_node_names_and_namespaces().count(("slam", "/")) == 1
     again = start("slam", "-p", "system:=one")
     listener.until(lambda: listener.node.get_node_names_and_namespaces().count(("slam", "/")) == 2, alive=[again])
     running = [again, other]
