@@ -30,7 +30,7 @@ def test_of_two_equal_rooms_one_is_the_twin_of_the_other():
     assert log_repetition(rooms((0.0, 30.0), 0)) > 0.3
 
 
-def test_a_map_of_one_place_tells_nothing():
+def test_a_map_of_one_place_is_no_evidence():
     assert log_repetition(rooms((0.0,), 0)) == 0.0
 
 

@@ -41,7 +41,7 @@ _IDLE = ("unconfigured", "finalized")
 class PrecedenceMonitor:
     """Finds systems that were started earlier, by diagnostics of living nodes and by doubled names in the ROS graph.
 
-    DDS lists a killed node for 20 s, but it says nothing; a played bag may speak for a node that is not in the graph.
+    DDS lists a killed node for 20 s, but it sends nothing; a played bag may speak for a node that is not in the graph.
 
     :ivar knows_coordinator: whether diagnostics of slam of the same system have come.
     """

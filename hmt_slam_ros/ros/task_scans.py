@@ -54,13 +54,13 @@ class TaskScans:
         if due is None:
             self._node.diagnostics.count_refused(topic)
         elif self._node.is_driver and self._merge.silent_topics:
-            self._stand(topic)
+            self._halt_robot(topic)
         else:
             self._scans_beside_silence = 0
             for each in due:
                 self._deliver(each)
 
-    def _stand(self, topic: str) -> None:
+    def _halt_robot(self, topic: str) -> None:
         """Stop the robot beside a silent laser."""
         self._node.stop_robot()
         self._scans_beside_silence += 1

@@ -7,7 +7,7 @@ false. With R the repetition,
 
     log P(map | R) / P(map | not R) = log(q + (1 - q) mean over placements of P(windows | twin) / P(windows | chance))
 
-and q the probability that the twin lies beyond the map. Parts that were not searched tell nothing: they count 1
+and q the probability that the twin lies beyond the map. Parts that were not searched are no evidence: they count 1
 (docs/decisions/0085-repetition.md).
 """
 

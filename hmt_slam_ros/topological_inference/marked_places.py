@@ -1,7 +1,7 @@
 """Where marks put a lost robot (docs/decisions/0088-marks-of-a-lost-robot.md).
 
 A mark that was visited before puts the robot's keyframes at a pose, if it is right. So the prior over the places of the
-map is a mixture of "it tells nothing", which leaves it flat, and "they are where it was visited".
+map is a mixture of "it is no evidence", which leaves it flat, and "they are where it was visited".
 """
 
 from __future__ import annotations
