@@ -20,8 +20,8 @@ from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidat
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     HypothesisState,
 )
-from hmt_slam_ros.topological_inference.marked_places import NO_MARKS
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
+from hmt_slam_ros.topological_inference.search_prior import FLAT_PRIOR, SearchPrior
 
 OPTIONS = replace(Configuration().tsbi, relocalization_probability=0.8, relocalization_share=0.6, hint_probability=0.7)
 ARC = np.array([3.0, 1.0, 0.7])
@@ -63,33 +63,33 @@ class GivenSearch(SimpleNamespace):
         self.search = SimpleNamespace(gating=CandidateGating(OPTIONS))
         self.map_search = SimpleNamespace(
             work=EventWork(),
-            check_candidates=lambda _map, search, _clutter, _hint=None, _marks=None: (search, True),
+            check_candidates=lambda _map, search, _clutter, _prior=None: (search, True),
             begin=self.begin,
             continue_search=self.go_on,
             search_now=lambda hybrid_map, search, area, _clutter: self.go_on(hybrid_map, search, area),
             plausible_areas=lambda _map, _found: frozenset({1, 2}),
-            is_conclusive=lambda _map, _search, _clutter, _hint=None, _marks=None: self.remaining == 0,
+            is_conclusive=lambda _map, _search, _clutter, _prior=None: self.remaining == 0,
         )
 
-    def begin(self, _hybrid_map, poses, before, hint=None, only=()):
-        self.requested, self.only = (poses, before, hint), only
+    def begin(self, _hybrid_map, poses, before, prior=FLAT_PRIOR, only=()):
+        self.requested, self.only = (poses, before, prior.hint), only
         return GlobalSearch(poses, before, 3, dict(self.unexamined), self.found.candidates)
 
-    def go_on(self, _hybrid_map, search, first=None, _marks=None):
+    def go_on(self, _hybrid_map, search, first=None, _prior=None):
         self.first_areas.append(first)
         self.remaining -= 1
         return search if self.remaining else replace(search, unexamined={})
 
-    def find_marked_places(self, _parent, _search):
-        return NO_MARKS
+    def find_search_prior(self, _parent, lost, poses):
+        return FLAT_PRIOR if lost.pose_hint is None else SearchPrior(lost.pose_hint.at_first(poses))
 
     def is_marked(self, keyframes, before):
         assert min(keyframes) >= before
         return self.marked in keyframes
 
-    def localize_globally(self, _parent, search, hint=None, _marks=None):
+    def localize_globally(self, _parent, search, prior=FLAT_PRIOR):
         assert search.poses is self.requested[0]
-        assert (hint is None) is (self.requested[2] is None)
+        assert (prior.hint is None) is (self.requested[2] is None)
         return self.found
 
 

@@ -24,7 +24,6 @@ from hmt_slam_ros.topological_inference import event_work
 from hmt_slam_ros.topological_inference.event_work import EventWork
 from hmt_slam_ros.topological_inference.global_localization import (
     GlobalSearch,
-    PoseHint,
     begin_search,
     check_candidates,
     continue_search,
@@ -39,12 +38,13 @@ from hmt_slam_ros.topological_inference.global_scan_matching import (
     Region,
     RegionMatch,
 )
-from hmt_slam_ros.topological_inference.marked_places import NO_MARKS, MarkedPlaces, MarkedPose
+from hmt_slam_ros.topological_inference.marked_places import MarkedPlaces, MarkedPose
 from hmt_slam_ros.topological_inference.pose_distribution import (
     UNMAPPED_PRIOR,
     PoseDistribution,
     summarize_localization,
 )
+from hmt_slam_ros.topological_inference.search_prior import FLAT_PRIOR, PoseHint, SearchPrior
 
 shares = st.lists(st.floats(0.001, 1.0), min_size=1, max_size=5)
 
@@ -247,7 +247,7 @@ def test_candidates_that_were_refuted_wait_for_another_or_for_the_end():
     for count, refuted, left, conclusive in ((1, 0, 1, True), (1, 1, 1, False), (2, 1, 1, True), (1, 1, 0, True)):
         unexamined = {1: 0.1} if left else {}
         search = GlobalSearch({}, 9, 5, unexamined, candidates[:count], refuted=refuted)
-        assert is_conclusive(search, 0.01, HybridMap(), NO_CLUTTER, None, 0.3) is conclusive
+        assert is_conclusive(search, 0.01, HybridMap(), NO_CLUTTER, 0.3) is conclusive
 
 
 def test_what_was_not_searched_may_match_as_well_and_the_candidate_by_chance():
@@ -262,7 +262,7 @@ def test_what_was_not_searched_may_match_as_well_and_the_candidate_by_chance():
         found = localize_globally(search, 0.01, HybridMap(), NO_CLUTTER)
         assert found.probabilities.tolist() == pytest.approx([expected])
         bounds = (expected - 1e-6, expected + 1e-6)
-        conclusive = [is_conclusive(search, 0.01, HybridMap(), NO_CLUTTER, None, bound) for bound in bounds]
+        conclusive = [is_conclusive(search, 0.01, HybridMap(), NO_CLUTTER, bound) for bound in bounds]
         assert conclusive == [True, not unexamined]
 
 
@@ -280,10 +280,10 @@ def test_an_initial_pose_reaches_four_deviations_of_its_least_certain_direction(
         hybrid_map.set_arc(0, area, PoseGaussian(arc, 1e-4 * np.eye(3)), closure=False)
     covariance = rotation @ np.diag([0.1, 0.6, 0.2]) ** 2 @ rotation.T
     at = se2.transform(arc, [1.0, -0.5]) + (1.5 + 4.0 * 0.6 - reach) * np.array([0.6, -0.8])
-    pose_hint = PoseHint(9, 0, PoseGaussian(np.array([*at, 0.4]), covariance))
+    prior = SearchPrior(PoseHint(9, 0, PoseGaussian(np.array([*at, 0.4]), covariance)))
     # The keyframe of area 2 came when the robot was lost already.
     areas = dict.fromkeys(range(3), 1.0 / 3.0)
-    search = begin_search(hybrid_map, {9: np.zeros(3)}, 8, areas, pose_hint, 1.5)
+    search = begin_search(hybrid_map, {9: np.zeros(3)}, 8, areas, prior, 1.5)
     assert list(search.unexamined) == ([1] if reach > 0.0 else [])
 
 
@@ -296,8 +296,8 @@ def test_an_initial_pose_weighs_candidates_by_their_distance_in_both_covariances
     hint = PoseGaussian(np.array([0.4, 0.9, 0.5]), np.array([[0.3, 0.1, 0.0], [0.1, 0.2, 0.02], [0.0, 0.02, 0.1]]))
     search = GlobalSearch({9: np.zeros(3)}, 9, 2, {}, tuple(map(make_candidate, range(2))))
     flat, found = (
-        localize_globally(search, 0.01, hybrid_map, NO_CLUTTER, pose_hint).probabilities
-        for pose_hint in (None, PoseHint(9, 0, hint))
+        localize_globally(search, 0.01, hybrid_map, NO_CLUTTER, prior).probabilities
+        for prior in (FLAT_PRIOR, SearchPrior(PoseHint(9, 0, hint)))
     )
     measured = make_candidate(0).mode.measured
     odds = []
@@ -318,9 +318,9 @@ def test_only_areas_near_an_initial_pose_are_searched(x, y, near):
         hybrid_map.set_keyframe(area, area, np.zeros(3))
         if area:
             hybrid_map.set_arc(0, area, PoseGaussian(np.array([*position, 0.0]), 1e-4 * np.eye(3)), closure=False)
-    pose_hint = PoseHint(9, 0, PoseGaussian(np.array([x, y, 0.0]), np.diag([0.25, 0.25, 0.1])))
+    prior = SearchPrior(PoseHint(9, 0, PoseGaussian(np.array([x, y, 0.0]), np.diag([0.25, 0.25, 0.1]))))
     areas = dict.fromkeys(range(3), 1.0 / 3.0)
-    search = begin_search(hybrid_map, {9: np.zeros(3)}, 9, areas, pose_hint, 2.0)
+    search = begin_search(hybrid_map, {9: np.zeros(3)}, 9, areas, prior, 2.0)
     assert (list(search.unexamined), search.areas) == (near, len(near))
 
 
@@ -341,14 +341,14 @@ def test_the_area_that_a_mark_points_to_is_searched_first_and_ends_the_search():
     walls = Agreement(0, 0, 0)
     areas = dict.fromkeys(range(20), 0.05)
     sharp = PoseGaussian(np.zeros(3), np.diag([0.1, 0.1, 0.05]) ** 2)
-    marks = MarkedPlaces(((MarkedPose(7, sharp),),), 0.05)
-    for own, first, conclusive in ((marks, 7, True), (NO_MARKS, 0, False)):
+    marked = SearchPrior(marks=MarkedPlaces(((MarkedPose(7, sharp),),), 0.05))
+    for prior, first, conclusive in ((marked, 7, True), (FLAT_PRIOR, 0, False)):
         matcher = GivenWalls([walls] * 20, agreements={area: Agreement(100, 90, 0) for area in areas})
         matcher.work = event_work._MAX_WORK
         search = begin_search(map_of(20), {90: np.zeros(3)}, 90, areas)
-        search = continue_search(search, matcher, map_of(20), matcher.event, marks=own)
+        search = continue_search(search, matcher, map_of(20), matcher.event, prior=prior)
         assert matcher.searched == [first]
         search = replace(
             search, candidates=tuple(c._replace(mode=c.mode._replace(measured=sharp)) for c in search.candidates)
         )
-        assert is_conclusive(search, 0.3, map_of(20), NO_CLUTTER, None, 0.8, own) is conclusive
+        assert is_conclusive(search, 0.3, map_of(20), NO_CLUTTER, 0.8, prior) is conclusive

@@ -9,13 +9,13 @@ from relocalizing import OPTIONS, SHARP, GivenSearch, candidate, distribution, m
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.topological_inference import event_work, relocalization
-from hmt_slam_ros.topological_inference.global_localization import PoseHint
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     FalseAlarm,
     Lost,
     PoseInArea,
     Tracking,
 )
+from hmt_slam_ros.topological_inference.search_prior import PoseHint, SearchPrior
 
 
 def test_a_lost_robot_is_searched_by_its_keyframes_seen_from_the_first():
@@ -99,12 +99,12 @@ class ExhaustingSearch(GivenSearch):
         super().__init__(**given)
         self.map_search.check_candidates = self.check
 
-    def go_on(self, hybrid_map, search, first=None, marks=None):
-        search = super().go_on(hybrid_map, search, first, marks)
+    def go_on(self, hybrid_map, search, first=None, prior=None):
+        search = super().go_on(hybrid_map, search, first, prior)
         self.map_search.work.add(event_work._MAX_WORK)
         return replace(search, unexamined={3: 0.1} if search.candidates else {})
 
-    def check(self, _hybrid_map, search, _clutter, _hint=None, _marks=None):
+    def check(self, _hybrid_map, search, _clutter, _prior=None):
         return search, not (search.candidates and self.map_search.work.is_exhausted)
 
 
@@ -158,7 +158,7 @@ def test_the_reference_of_a_search_lies_where_its_newest_keyframe_is_now():
     branching = GivenSearch(options=OPTIONS, found=distribution((candidate(1, pose), 0.95)))
     parent = make_parent(Lost(21, pose_hint=hint))
     poses = {3: np.zeros(3), 24: np.array([1.0, 0.2, 0.1]), 25: np.array([1.5, 0.3, 0.2])}
-    search = branching.begin({}, poses, 2, hint)
+    search = branching.begin({}, poses, 2, SearchPrior(hint))
     parent = make_parent(Lost(21, pose_hint=hint, search=search))
     _, relocalized = relocalization.update_relocalization(branching, parent).children
     reference = se2.compose(parent.hybrid_map.keyframes(5)[25], se2.inverse(poses[25]))

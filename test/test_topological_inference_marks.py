@@ -13,12 +13,16 @@ from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.saved_map.validation import check_record
 from hmt_slam_ros.sensors import MarkObservation
+from hmt_slam_ros.topological_inference.branches import Parent
+from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.candidate_gating import Query, Transition
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
+from hmt_slam_ros.topological_inference.hypothesis_tree import HypothesisState, Lost
 from hmt_slam_ros.topological_inference.marked_places import NO_MARKS, MarkedPlaceFinder
 from hmt_slam_ros.topological_inference.marks import (
     Anchor,
@@ -31,6 +35,8 @@ from hmt_slam_ros.topological_inference.marks import (
     mix_transition,
     nearest_anchor,
 )
+from hmt_slam_ros.topological_inference.pose_distribution import UNMAPPED_PRIOR
+from hmt_slam_ros.topological_inference.search_prior import PoseHint
 
 WRONG = Configuration().marks.wrong_share
 SHARP = np.diag([0.03, 0.03, 0.02]) ** 2
@@ -329,6 +335,18 @@ def test_a_mark_alone_is_as_sure_as_it_is_right_and_its_visits_share_that(earlie
     probabilities = weights / (weights.sum() + 0.2 * math.exp(places.log_unmarked))
     assert probabilities[10] == pytest.approx((1.0 - WRONG) * share, abs=2e-3)
     assert probabilities[40] < WRONG * flat * 1.01
+
+
+def test_a_mark_tells_nothing_beside_an_initial_pose_of_a_searched_keyframe():
+    branching = Branching(Configuration(), Replica())
+    branching.marks = lost_memory(visit(3, line_pose(1, 1.0)), pose=line_pose(1, 0.5))
+    parent = Parent(4, 2, line(0.1), HypothesisState(), 0.0)
+    for keyframe, is_searched in ((9, True), (7, False)):
+        hint = PoseHint(keyframe, 1, PoseGaussian(np.zeros(3), np.eye(3)))
+        prior = branching.find_search_prior(parent, Lost(8, pose_hint=hint), LOST)
+        assert (prior.hint is not None, len(prior.marks.marks)) == (is_searched, 0 if is_searched else 1)
+        assert prior.without_marks().hint is prior.hint
+        assert prior.without_marks().log_unmapped == math.log(UNMAPPED_PRIOR)
 
 
 def test_the_visit_of_a_robot_that_is_lost_since_is_another_one():

@@ -26,7 +26,6 @@ from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative, uninformativ
 from hmt_slam_ros.messages.map_changes import InitialPose
 from hmt_slam_ros.topological_inference import relocalization, relocalization_arcs
 from hmt_slam_ros.topological_inference.branches import Branches
-from hmt_slam_ros.topological_inference.global_localization import PoseHint
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     FalseAlarm,
     HypothesisState,
@@ -35,6 +34,7 @@ from hmt_slam_ros.topological_inference.hypothesis_tree import (
     Tracking,
 )
 from hmt_slam_ros.topological_inference.kidnapping_prior import EventCounts
+from hmt_slam_ros.topological_inference.search_prior import PoseHint
 
 
 @pytest.mark.parametrize(

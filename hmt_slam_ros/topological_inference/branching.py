@@ -44,16 +44,17 @@ from hmt_slam_ros.topological_inference.closure_search import (
     first_new_keyframe,
     known_ground_log_ratio,
 )
-from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, LandmarkEvidence, PoseHint
+from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, LandmarkEvidence
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     Lost,
     Tracking,
 )
 from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingPriors
 from hmt_slam_ros.topological_inference.map_search import MapSearch
-from hmt_slam_ros.topological_inference.marked_places import NO_MARKS, MarkedPlaceFinder, MarkedPlaces
+from hmt_slam_ros.topological_inference.marked_places import MarkedPlaceFinder
 from hmt_slam_ros.topological_inference.marks import AreaMark, MarkEvidence, MarkMemory
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
+from hmt_slam_ros.topological_inference.search_prior import FLAT_PRIOR, SearchPrior
 from hmt_slam_ros.topological_inference.statements import (
     PlaceStatements,
     StatementQueue,
@@ -161,28 +162,29 @@ class Branching:
         self.statements.queue = state.statements
 
     def localize_globally(
-        self,
-        parent: Parent,
-        search: GlobalSearch,
-        pose_hint: PoseHint | None = None,
-        marks: MarkedPlaces = NO_MARKS,
+        self, parent: Parent, search: GlobalSearch, prior: SearchPrior = FLAT_PRIOR
     ) -> PoseDistribution:
         """The distribution of the keyframes' pose in the whole map, as far as it was searched.
 
         Landmarks count from the second search with a candidate on, since one search alone localizes nobody.
 
-        :param pose_hint: of the reference.
-        :param marks: where marks put the keyframes.
+        :param prior: of the reference.
         """
-        distribution = self.map_search.localize(parent.hybrid_map, search, parent.clutter, pose_hint, marks)
+        distribution = self.map_search.localize(parent.hybrid_map, search, parent.clutter, prior)
         lost = parent.state.localization
         if self.landmarks is None or not isinstance(lost, Lost) or lost.candidate is None:
             return distribution
         return self.landmarks.weigh(distribution, parent.hybrid_map, search.poses, search.before)
 
-    def find_marked_places(self, parent: Parent, search: GlobalSearch) -> MarkedPlaces:
-        """Where marks put the keyframes of a search."""
-        return self._marked_places.find(parent.hybrid_map, search.poses, search.before, self.marks)
+    def find_search_prior(self, parent: Parent, lost: Lost, poses: Mapping[int, Float64]) -> SearchPrior:
+        """What is known of the pose of keyframes beside scans: by the hint for one of them, or else by marks.
+
+        :param poses: {keyframe: ``reference_T_base`` (3,)}; the reference is the first.
+        """
+        hint = None if lost.pose_hint is None else lost.pose_hint.at_first(poses)
+        if hint is not None:
+            return SearchPrior(hint)
+        return SearchPrior(marks=self._marked_places.find(parent.hybrid_map, poses, lost.since, self.marks))
 
     def is_marked(self, keyframes: Collection[int], before: int) -> bool:
         """Whether a mark is visited at one of some keyframes that was visited before another one."""

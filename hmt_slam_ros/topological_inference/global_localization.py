@@ -1,4 +1,4 @@
-"""Global localization: Eq. (6) with a prior that is flat over all known areas.
+"""Global localization: Eq. (6) over all known areas, with a prior that is flat unless more is known.
 
 Blanco et al. name global localization ("robot awakening") as future work: a topological loop closure whose prior is
 uninformative. All keyframes since the robot was lost are matched into every area, at all positions in its place and
@@ -16,11 +16,8 @@ import numpy as np
 import scipy
 
 from hmt_slam_ros.arrays import Float64
-from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
-from hmt_slam_ros.hybrid_map.surroundings import areas_around, keyframe_positions
+from hmt_slam_ros.hybrid_map.surroundings import areas_around
 from hmt_slam_ros.messages.messages import Notice
 from hmt_slam_ros.registration.consistency import (
     MAP_IN_MAP,
@@ -35,9 +32,9 @@ from hmt_slam_ros.topological_inference.global_scan_matching import (
     PoseCandidate,
     region_neighborhood,
 )
-from hmt_slam_ros.topological_inference.marked_places import NO_MARKS, MarkedPlaces
 from hmt_slam_ros.topological_inference.place_recognition import PerceptualAliasing
 from hmt_slam_ros.topological_inference.pose_distribution import MIN_PROBABILITY, UNMAPPED_PRIOR, PoseDistribution
+from hmt_slam_ros.topological_inference.search_prior import FLAT_PRIOR, SearchPrior
 
 Pose = Float64
 
@@ -55,23 +52,6 @@ _MIN_MAPPED_PROBABILITY = 0.5
 
 _MIN_PLAUSIBLE_RATIO = 1e-3
 """Smallest ratio of the probabilities of a candidate and of the best with which its area is searched again."""
-
-_HINT_DEVIATIONS = 4.0
-"""Deviations of a pose hint beyond which no area is searched."""
-
-
-@dataclass(frozen=True, eq=False)
-class PoseHint:
-    """The pose of a keyframe that a person gave.
-
-    :ivar keyframe: its number.
-    :ivar area: a known area.
-    :ivar pose: belief over ``area_T_base`` of the keyframe.
-    """
-
-    keyframe: int
-    area: int
-    pose: PoseGaussian
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +82,18 @@ class GlobalSearch:
         """The largest matched share of the candidates."""
         return max((candidate.agreement.matched_share for candidate in self.candidates), default=0.0)
 
+    @property
+    def flat_prior(self) -> float:
+        """Prior probability of each area where nothing is known beside scans."""
+        return (1.0 - UNMAPPED_PRIOR) / max(1, self.areas)
+
 
 def begin_search(
     hybrid_map: HybridMap,
     poses: Mapping[int, Pose],
     before: int,
     area_probabilities: Mapping[int, float],
-    pose_hint: PoseHint | None = None,
+    prior: SearchPrior = FLAT_PRIOR,
     radius: float = 0.0,
     only: Collection[int] = (),
 ) -> GlobalSearch:
@@ -117,14 +102,13 @@ def begin_search(
     :param poses: {keyframe: ``reference_T_base`` (3,)}.
     :param before: the map is that of the keyframes before this one.
     :param area_probabilities: {area: probability by its appearance} of all known areas.
-    :param pose_hint: of the reference; it excludes areas that are farther away.
+    :param prior: of the reference; a hint excludes areas that are farther away.
     :param radius: largest distance to a keyframe of an area's place, m.
     :param only: the only areas to search, since fewer keyframes fitted nowhere else; all if empty.
     """
-    near = None if pose_hint is None else _areas_near_hint(hybrid_map, pose_hint, radius, before)
-    areas = {area: p for area, p in area_probabilities.items() if near is None or area in near}
+    areas = prior.admitted_areas(hybrid_map, area_probabilities, radius, before)
     unexamined = {area: p for area, p in areas.items() if not only or area in only}
-    return GlobalSearch(poses, before, len(areas), unexamined, is_map_missing=bool(only or pose_hint))
+    return GlobalSearch(poses, before, len(areas), unexamined, is_map_missing=bool(only or prior.hint))
 
 
 def continue_search(
@@ -133,7 +117,7 @@ def continue_search(
     hybrid_map: HybridMap,
     work: EventWork,
     first: int | None = None,
-    marks: MarkedPlaces = NO_MARKS,
+    prior: SearchPrior = FLAT_PRIOR,
 ) -> GlobalSearch:
     """The search after the regions of one event, the most probable by their appearance and by marks.
 
@@ -141,11 +125,11 @@ def continue_search(
 
     :param work: of the event, to which that of the search is added.
     :param first: the area whose region comes first, if it was not searched yet.
-    :param marks: where marks put the keyframes.
+    :param prior: of the reference.
     """
     search = _without_missing_areas(search, hybrid_map)
     while search.unexamined and not work.is_exhausted:
-        search = _step(search, matcher, hybrid_map, work, first, marks)
+        search = _step(search, matcher, hybrid_map, work, first, prior)
     return search
 
 
@@ -175,10 +159,10 @@ def _step(
     hybrid_map: HybridMap,
     work: EventWork,
     first: int | None,
-    marks: MarkedPlaces = NO_MARKS,
+    prior: SearchPrior = FLAT_PRIOR,
 ) -> GlobalSearch:
     """The search after the next map was made, or the next region was matched."""
-    probabilities = _marked_probabilities(search, marks)
+    probabilities = prior.weigh_areas(search.unexamined, search.flat_prior)
     if first is not None and first in probabilities:
         probabilities[first] = 1.0
     region = matcher.find_region(hybrid_map, search.before, probabilities)
@@ -199,17 +183,6 @@ def _step(
     )
 
 
-def _flat_prior(search: GlobalSearch) -> float:
-    """Prior probability of each area."""
-    return (1.0 - UNMAPPED_PRIOR) / max(1, search.areas)
-
-
-def _marked_probabilities(search: GlobalSearch, marks: MarkedPlaces) -> dict[int, float]:
-    """{area that was not searched yet: its probability by appearance, with the factor of marks}."""
-    factors = marks.area_factors(search.unexamined, _flat_prior(search))
-    return {area: probability * factors[area] for area, probability in search.unexamined.items()}
-
-
 def check_candidates(
     search: GlobalSearch,
     matcher: GlobalScanMatcher,
@@ -217,8 +190,7 @@ def check_candidates(
     aliasing_prior: float,
     hybrid_map: HybridMap,
     clutter: Clutter,
-    pose_hint: PoseHint | None = None,
-    marks: MarkedPlaces = NO_MARKS,
+    prior: SearchPrior = FLAT_PRIOR,
 ) -> tuple[GlobalSearch, bool]:
     """The search after the walls of its probable candidates were checked, and whether all were at this event.
 
@@ -227,7 +199,7 @@ def check_candidates(
     """
     search = _without_missing_areas(search, hybrid_map)
     candidates = list(search.candidates)
-    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint, marks)
+    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, prior)
     likely = np.flatnonzero(_probabilities(log_weights, log_rest) >= _MIN_WALL_CHECK_PROBABILITY)
     left = [n for n in likely.tolist() if candidates[n].walls is None]
     while left and not work.is_exhausted:
@@ -243,8 +215,7 @@ def localize_globally(
     aliasing_prior: float,
     hybrid_map: HybridMap,
     clutter: Clutter,
-    pose_hint: PoseHint | None = None,
-    marks: MarkedPlaces = NO_MARKS,
+    prior: SearchPrior = FLAT_PRIOR,
 ) -> PoseDistribution:
     """The distribution of the pose of some keyframes in the whole map, as far as it was searched.
 
@@ -252,10 +223,9 @@ def localize_globally(
 
     :param aliasing_prior: prior probability that keyframes match an area in which they do not lie.
     :param clutter: usual rate of contradictions of the robot's map, where that is above the rate of maps.
-    :param pose_hint: of the reference.
-    :param marks: where marks put the keyframes.
+    :param prior: of the reference.
     """
-    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint, marks)
+    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, prior)
     wall_rate = max(WALLS_OUTLIER_RATE, _OLD_MAP_FACTOR * clutter.wall_outlier_rate)
     for n, candidate in enumerate(search.candidates):
         if candidate.walls is not None:
@@ -285,48 +255,40 @@ def is_conclusive(
     aliasing_prior: float,
     hybrid_map: HybridMap,
     clutter: Clutter,
-    pose_hint: PoseHint | None,
     probability: float,
-    marks: MarkedPlaces = NO_MARKS,
+    prior: SearchPrior = FLAT_PRIOR,
 ) -> bool:
     """Whether the search is over: all areas were searched, or a candidate is probable in spite of those that were not.
 
     Candidates that were tested in vain wait for another one, or for the end of the search.
 
     :param probability: of such a candidate, before walls count against it.
-    :param marks: where marks put the keyframes.
+    :param prior: of the reference.
     """
     if not search.unexamined:
         return True
     if len(search.candidates) <= search.refuted:
         return False
-    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, pose_hint, marks)
+    log_weights, log_rest = _log_weights(search, aliasing_prior, hybrid_map, clutter, prior)
     return bool(_probabilities(log_weights, log_rest).max(initial=0.0) >= probability)
 
 
 def _log_weights(
-    search: GlobalSearch,
-    aliasing_prior: float,
-    hybrid_map: HybridMap,
-    clutter: Clutter,
-    pose_hint: PoseHint | None,
-    marks: MarkedPlaces,
+    search: GlobalSearch, aliasing_prior: float, hybrid_map: HybridMap, clutter: Clutter, prior: SearchPrior
 ) -> tuple[list[float], float]:
     """Log of the weight of every candidate, and of the rest: unmapped ground, and the areas that were not searched.
 
     The best matches in the other areas show how distinctive a match is. Whether the keyframes are in the map at all is
     tested with the best match. Between candidates the surfaces also count that are known at one and not at the other.
-    A pose hint replaces the flat prior by one as wide as its covariance. In an area that was not searched keyframes
-    may match as well as at the best candidate, which is there by chance then, as improbable as it is distinctive.
-    Marks make the flat prior a mixture.
+    In an area that was not searched keyframes may match as well as at the best candidate, which is there by chance
+    then, as improbable as it is distinctive.
     """
     log_mass: dict[int, float] = {}
     for candidate in search.candidates:
         log_mass[candidate.area] = float(np.logaddexp(log_mass.get(candidate.area, -math.inf), candidate.mode.log_mass))
     max_log_mass = max(log_mass.values(), default=0.0)
-    log_flat = math.log(_flat_prior(search))
-    log_marks = marks.log_factors(hybrid_map, search.candidates, _flat_prior(search))
-    log_priors = _log_hint_priors(search, hybrid_map, pose_hint) if pose_hint else {}
+    log_priors = prior.log_priors(hybrid_map, search.candidates, search.flat_prior)
+    log_marks = prior.log_mark_factors(hybrid_map, search.candidates, search.flat_prior)
     outlier_rate = max(MAPS_OUTLIER_RATE, clutter.beam_outlier_rate)
     aliasing = PerceptualAliasing(aliasing_prior)
     aliasing.add_negatives(_other_shares(search))
@@ -339,11 +301,12 @@ def _log_weights(
             + MAP_IN_MAP.log_likelihood_ratio(c.agreement, outlier_rate)
         )
         distinctiveness = aliasing.log_distinctiveness(c.agreement.matched_share, already_expected=False)
-        log_weights.append(log_priors.get(n, log_flat) + log_there + distinctiveness + log_marks[n])
+        log_weights.append(log_priors[n] + log_there + distinctiveness + log_marks[n])
         log_chance = max(log_chance, log_there)
-    unexamined = (1.0 - UNMAPPED_PRIOR) * sum(_marked_probabilities(search, marks).values())
+    weights = prior.weigh_areas(search.unexamined, search.flat_prior)
+    unexamined = (1.0 - UNMAPPED_PRIOR) * sum(weights.values())
     log_unexamined = math.log(max(unexamined, MIN_PROBABILITY)) + log_chance
-    return log_weights, float(np.logaddexp(math.log(UNMAPPED_PRIOR) + marks.log_unmarked, log_unexamined))
+    return log_weights, float(np.logaddexp(prior.log_unmapped, log_unexamined))
 
 
 def _other_shares(search: GlobalSearch) -> list[float]:
@@ -358,36 +321,6 @@ def _other_shares(search: GlobalSearch) -> list[float]:
 def _probabilities(log_weights: Sequence[float], log_rest: float) -> Float64:
     """Probabilities of candidates beside the rest, shape (len(log_weights),)."""
     return np.asarray(scipy.special.softmax(np.array([*log_weights, log_rest]))[:-1], dtype=np.float64)
-
-
-def _areas_near_hint(hybrid_map: HybridMap, pose_hint: PoseHint, radius: float, before: int) -> dict[int, PoseGaussian]:
-    """{area: belief over ``hint_area_T_area``} of those in which the reference may be."""
-    if not hybrid_map.has_area(pose_hint.area):
-        return {}
-    reach = radius + _HINT_DEVIATIONS * math.sqrt(float(np.linalg.eigvalsh(pose_hint.pose.covariance[:2, :2]).max()))
-    near = {}
-    for area, belief in connected_areas(hybrid_map, pose_hint.area).items():
-        if min(hybrid_map.keyframes(area), default=before) >= before:
-            continue
-        offsets = keyframe_positions(hybrid_map, area, belief.mean) - pose_hint.pose.mean[:2]
-        if np.hypot(*offsets.T).min() <= reach:
-            near[area] = belief
-    return near
-
-
-def _log_hint_priors(search: GlobalSearch, hybrid_map: HybridMap, pose_hint: PoseHint) -> dict[int, float]:
-    """Log-priors of the candidates, by their number, by a pose hint, relative to the best that there could be."""
-    if not hybrid_map.has_area(pose_hint.area):
-        return {}
-    beliefs = connected_areas(hybrid_map, pose_hint.area)
-    priors = {}
-    for n, candidate in enumerate(search.candidates):
-        if candidate.area in beliefs:
-            pose = beliefs[candidate.area].compose(candidate.mode.measured)
-            difference = se2.log(se2.between(pose_hint.pose.mean, pose.mean))
-            distance = float(difference @ np.linalg.solve(pose_hint.pose.covariance + pose.covariance, difference))
-            priors[n] = math.log(1.0 - UNMAPPED_PRIOR) - 0.5 * distance
-    return priors
 
 
 class LandmarkEvidence(Protocol):

@@ -13,7 +13,7 @@ from hmt_slam_ros.arrays import Float64, Int64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.messages import MotionCondition
 from hmt_slam_ros.topological_inference.area_comparison import OngoingComparison
-from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseHint
+from hmt_slam_ros.topological_inference.global_localization import GlobalSearch
 from hmt_slam_ros.topological_inference.kidnapping_evidence import (
     CUSUM_DRIFT,
     EVIDENCE_WINDOW,
@@ -21,6 +21,7 @@ from hmt_slam_ros.topological_inference.kidnapping_evidence import (
     log_displacement_ratio,
 )
 from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingCounts, KidnappingPriors, add_counts
+from hmt_slam_ros.topological_inference.search_prior import PoseHint
 from hmt_slam_ros.topological_inference.surroundings_change import Surroundings
 
 Covariance = Float64

@@ -15,7 +15,6 @@ from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.topological_inference.event_work import CELL_WORK, EventWork
 from hmt_slam_ros.topological_inference.global_localization import (
     GlobalSearch,
-    PoseHint,
     begin_search,
     check_candidates,
     continue_search,
@@ -25,9 +24,9 @@ from hmt_slam_ros.topological_inference.global_localization import (
     search_region,
 )
 from hmt_slam_ros.topological_inference.global_scan_matching import FreeSpaceCheck, GlobalScanMatcher
-from hmt_slam_ros.topological_inference.marked_places import NO_MARKS, MarkedPlaces
 from hmt_slam_ros.topological_inference.place_recognition import ScanDescriptors
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
+from hmt_slam_ros.topological_inference.search_prior import FLAT_PRIOR, SearchPrior
 
 Pose = Float64
 
@@ -77,30 +76,30 @@ class MapSearch:
         hybrid_map: HybridMap,
         poses: Mapping[int, Pose],
         before: int,
-        pose_hint: PoseHint | None = None,
+        prior: SearchPrior = FLAT_PRIOR,
         only: Collection[int] = (),
     ) -> GlobalSearch:
         """A search of the whole map, before its first region.
 
         :param poses: {keyframe: ``reference_T_base``}.
         :param before: the map is that of the keyframes before this one.
-        :param pose_hint: of the reference.
+        :param prior: of the reference.
         :param only: the only areas to search, since fewer keyframes fitted nowhere else; all if empty.
         """
         known = {area: [k for k in hybrid_map.keyframes(area) if k < before] for area in hybrid_map.area_ids()}
         known = {area: keyframes for area, keyframes in known.items() if keyframes}
         probabilities = self._descriptors.area_probabilities(list(poses), known)
-        return begin_search(hybrid_map, poses, before, probabilities, pose_hint, self._options.place_radius, only)
+        return begin_search(hybrid_map, poses, before, probabilities, prior, self._options.place_radius, only)
 
     def continue_search(
-        self, hybrid_map: HybridMap, search: GlobalSearch, first: int | None = None, marks: MarkedPlaces = NO_MARKS
+        self, hybrid_map: HybridMap, search: GlobalSearch, first: int | None = None, prior: SearchPrior = FLAT_PRIOR
     ) -> GlobalSearch:
         """The search after one event.
 
         :param first: the area whose region comes first, if it was not searched yet.
-        :param marks: where marks put the keyframes.
+        :param prior: of the reference.
         """
-        return continue_search(search, self._matcher, hybrid_map, self.work, first, marks)
+        return continue_search(search, self._matcher, hybrid_map, self.work, first, prior)
 
     def search_now(self, hybrid_map: HybridMap, search: GlobalSearch, area: int, clutter: Clutter) -> GlobalSearch:
         """The search after the region of an area and the walls there, whatever work they take, and others meanwhile.
@@ -110,61 +109,42 @@ class MapSearch:
         search = search_region(search, self._matcher, hybrid_map, self.work, area)
         search, is_checked = self.continue_search(hybrid_map, search), False
         while not is_checked:
-            own, prior = EventWork(), self._options.aliasing_prior
-            search, is_checked = check_candidates(search, self._matcher, own, prior, hybrid_map, clutter)
+            own, aliasing = EventWork(), self._options.aliasing_prior
+            search, is_checked = check_candidates(search, self._matcher, own, aliasing, hybrid_map, clutter)
             self.work.add(own.done)
         return search
 
     def check_candidates(
-        self,
-        hybrid_map: HybridMap,
-        search: GlobalSearch,
-        clutter: Clutter,
-        pose_hint: PoseHint | None = None,
-        marks: MarkedPlaces = NO_MARKS,
+        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, prior: SearchPrior = FLAT_PRIOR
     ) -> tuple[GlobalSearch, bool]:
         """The search after the walls of its probable candidates were checked, and whether all were at this event.
 
         :param clutter: usual rate of contradictions of the robot's map.
-        :param pose_hint: of the reference.
-        :param marks: where marks put the keyframes.
+        :param prior: of the reference.
         """
-        prior = self._options.aliasing_prior
-        return check_candidates(search, self._matcher, self.work, prior, hybrid_map, clutter, pose_hint, marks)
+        aliasing = self._options.aliasing_prior
+        return check_candidates(search, self._matcher, self.work, aliasing, hybrid_map, clutter, prior)
 
     def is_conclusive(
-        self,
-        hybrid_map: HybridMap,
-        search: GlobalSearch,
-        clutter: Clutter,
-        pose_hint: PoseHint | None = None,
-        marks: MarkedPlaces = NO_MARKS,
+        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, prior: SearchPrior = FLAT_PRIOR
     ) -> bool:
         """Whether the search is over.
 
         :param clutter: usual rate of contradictions of the robot's map.
-        :param pose_hint: of the reference.
-        :param marks: where marks put the keyframes.
+        :param prior: of the reference.
         """
         probability = self._options.relocalization_probability
-        return is_conclusive(search, self._options.aliasing_prior, hybrid_map, clutter, pose_hint, probability, marks)
+        return is_conclusive(search, self._options.aliasing_prior, hybrid_map, clutter, probability, prior)
 
     def localize(
-        self,
-        hybrid_map: HybridMap,
-        search: GlobalSearch,
-        clutter: Clutter,
-        pose_hint: PoseHint | None = None,
-        marks: MarkedPlaces = NO_MARKS,
+        self, hybrid_map: HybridMap, search: GlobalSearch, clutter: Clutter, prior: SearchPrior = FLAT_PRIOR
     ) -> PoseDistribution:
         """The distribution of the keyframes' pose in the whole map, as far as it was searched.
 
         :param clutter: usual rate of contradictions of the robot's map.
-        :param pose_hint: of the reference.
-        :param marks: where marks put the keyframes.
+        :param prior: of the reference.
         """
-        prior = self._options.aliasing_prior
-        return localize_globally(search, prior, hybrid_map, clutter, pose_hint, marks)
+        return localize_globally(search, self._options.aliasing_prior, hybrid_map, clutter, prior)
 
     def plausible_areas(self, hybrid_map: HybridMap, distribution: PoseDistribution) -> frozenset[int]:
         """The areas in which the keyframes of a search may be, and those around; none where they may be anywhere.

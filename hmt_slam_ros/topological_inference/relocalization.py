@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -25,12 +24,12 @@ from hmt_slam_ros.messages.map_changes import Arc, InitialPose
 from hmt_slam_ros.messages.messages import Keyframe
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.branching import Branching
-from hmt_slam_ros.topological_inference.global_localization import GlobalSearch, PoseHint
+from hmt_slam_ros.topological_inference.global_localization import GlobalSearch
 from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate, is_certain
 from hmt_slam_ros.topological_inference.hypothesis_tree import Lost, PoseInArea, Tracking
-from hmt_slam_ros.topological_inference.marked_places import NO_MARKS, MarkedPlaces
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
 from hmt_slam_ros.topological_inference.relocalization_arcs import hinted_arcs, hinted_pose, refuted_arcs
+from hmt_slam_ros.topological_inference.search_prior import PoseHint, SearchPrior
 
 Pose = Float64
 
@@ -163,16 +162,18 @@ def update_relocalization(branching: Branching, parent: Parent) -> Branches:
     """
     lost = parent.state.localization
     assert isinstance(lost, Lost)
-    if branching.map_search.work.is_exhausted:
+    map_search, hybrid_map = branching.map_search, parent.hybrid_map
+    if map_search.work.is_exhausted:
         return Branches([parent.unchanged_child()])
-    search = lost.search or _begin_search(branching, parent, lost)
-    prior = _search_prior(branching, parent, lost, search)
+    poses = _poses_to_search(parent, lost) if lost.search is None else lost.search.poses
+    prior = branching.find_search_prior(parent, lost, poses)
+    search = lost.search or map_search.begin(hybrid_map, poses, lost.since, prior, lost.plausible_areas)
     if lost.search is None or not _is_conclusive(branching, parent, lost, search, prior):
         first = None if lost.candidate is None else lost.candidate.area
-        search = branching.map_search.continue_search(parent.hybrid_map, search, first, prior.marks)
+        search = map_search.continue_search(hybrid_map, search, first, prior)
     is_over = _is_conclusive(branching, parent, lost, search, prior)
     if is_over:
-        search, is_over = branching.map_search.check_candidates(parent.hybrid_map, search, parent.clutter, *prior)
+        search, is_over = map_search.check_candidates(hybrid_map, search, parent.clutter, prior)
     if not is_over:
         return Branches([_child_with_localization(parent, replace(lost, search=search))])
     after = replace(lost, search=None, searched=max(search.poses))
@@ -184,27 +185,18 @@ def update_relocalization(branching: Branching, parent: Parent) -> Branches:
     return branches
 
 
-class _SearchPrior(NamedTuple):
-    """What is known of the pose of a search's reference beside scans.
-
-    :ivar hint: by a person.
-    :ivar marks: where marks put it; none with a hint.
-    """
-
-    hint: PoseHint | None
-    marks: MarkedPlaces
+def _poses_to_search(parent: Parent, lost: Lost) -> dict[int, Pose]:
+    """{keyframe: ``reference_T_base``} of the newest but those on unmapped ground; the reference is the first."""
+    keyframes = _poses_since(parent, max(lost.since, lost.unknown + 1))
+    reference = next(iter(keyframes.values()))
+    return {k: se2.between(reference, pose) for k, pose in keyframes.items()}
 
 
-def _search_prior(branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch) -> _SearchPrior:
-    hint = _hint_of_first(lost, search.poses)
-    return _SearchPrior(hint, NO_MARKS if hint is not None else branching.find_marked_places(parent, search))
-
-
-def _is_conclusive(branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch, prior: _SearchPrior) -> bool:
+def _is_conclusive(branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch, prior: SearchPrior) -> bool:
     """Whether the search is over; one that may confirm a candidate goes through all areas that are left to it."""
     if lost.candidate is not None and search.unexamined:
         return False
-    return branching.map_search.is_conclusive(parent.hybrid_map, search, parent.clutter, *prior)
+    return branching.map_search.is_conclusive(parent.hybrid_map, search, parent.clutter, prior)
 
 
 def _is_without_candidate(child: Child) -> bool:
@@ -212,17 +204,8 @@ def _is_without_candidate(child: Child) -> bool:
     return isinstance(localization, Lost) and localization.candidate is None
 
 
-def _begin_search(branching: Branching, parent: Parent, lost: Lost) -> GlobalSearch:
-    """A search for the newest keyframes but those on unmapped ground; with a candidate, where the last one fitted."""
-    keyframes = _poses_since(parent, max(lost.since, lost.unknown + 1))
-    reference = next(iter(keyframes.values()))
-    poses = {k: se2.between(reference, pose) for k, pose in keyframes.items()}
-    hint = _hint_of_first(lost, poses)
-    return branching.map_search.begin(parent.hybrid_map, poses, lost.since, hint, lost.plausible_areas)
-
-
 def _conclude_search(
-    branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch, prior: _SearchPrior
+    branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch, prior: SearchPrior
 ) -> Branches:
     """The children after a search: still lost, or relocalized.
 
@@ -238,7 +221,7 @@ def _conclude_search(
     # Marks have weighed against the hypotheses that are not lost already.
     unmarked = distribution
     if is_kidnapped and prior.marks.marks:
-        unmarked = _localize(branching, parent, lost, search, prior._replace(marks=NO_MARKS))
+        unmarked = _localize(branching, parent, lost, search, prior.without_marks())
     parent, lost = _reweight_by_evidence(parent, lost, unmarked, poses)
     lost = _after_refutation(lost, distribution, poses)
     best = distribution.best
@@ -266,10 +249,10 @@ def _conclude_search(
 
 
 def _localize(
-    branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch, prior: _SearchPrior
+    branching: Branching, parent: Parent, lost: Lost, search: GlobalSearch, prior: SearchPrior
 ) -> PoseDistribution:
     """The distribution of the pose of the keyframes that were searched."""
-    distribution = branching.localize_globally(parent, search, *prior)
+    distribution = branching.localize_globally(parent, search, prior)
     if lost.tracked_pose is not None:
         distribution = distribution.with_unmapped_prior(KIDNAPPED_UNMAPPED_PRIOR)
     return _with_false_alarm(parent.hybrid_map, lost, distribution, search.poses)
@@ -474,16 +457,6 @@ def _is_same_place(hybrid_map: HybridMap, one: PoseInArea, other: PoseInArea) ->
     difference = se2.between(one.pose, se2.compose(frames[other.area].mean, other.pose))
     is_near = math.hypot(difference[0], difference[1]) <= _SAME_DISTANCE
     return bool(is_near and abs(difference[2]) <= _SAME_ANGLE)
-
-
-def _hint_of_first(lost: Lost, keyframes: Mapping[int, Pose]) -> PoseHint | None:
-    """The pose hint for the first of keyframes, {keyframe: ``area_T_base``}, from that for one of them."""
-    hint = lost.pose_hint
-    if hint is None or hint.keyframe not in keyframes:
-        return None
-    first = next(iter(keyframes))
-    hinted_T_first = PoseGaussian.from_pose(se2.between(keyframes[hint.keyframe], keyframes[first]))
-    return PoseHint(first, hint.area, hint.pose.compose(hinted_T_first))
 
 
 def _poses_since(parent: Parent, keyframe: int) -> dict[int, Pose]:

@@ -10,8 +10,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative, shortest_path_beliefs, uninformative_belief
 from hmt_slam_ros.messages.map_changes import Arc
 from hmt_slam_ros.topological_inference.branches import Parent
-from hmt_slam_ros.topological_inference.global_localization import PoseHint
 from hmt_slam_ros.topological_inference.hypothesis_tree import Lost
+from hmt_slam_ros.topological_inference.search_prior import PoseHint
 
 Pose = Float64
 
