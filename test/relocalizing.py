@@ -11,7 +11,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
-from hmt_slam_ros.topological_inference import relocalization
+from hmt_slam_ros.topological_inference import pose_verification, relocalization
 from hmt_slam_ros.topological_inference.branches import Parent
 from hmt_slam_ros.topological_inference.candidate_gating import CandidateGating
 from hmt_slam_ros.topological_inference.event_work import EventWork
@@ -26,7 +26,7 @@ from hmt_slam_ros.topological_inference.search_prior import FLAT_PRIOR, SearchPr
 OPTIONS = replace(Configuration().tsbi, relocalization_probability=0.8, relocalization_share=0.6, hint_probability=0.7)
 ARC = np.array([3.0, 1.0, 0.7])
 SHARP, WIDE = np.diag([0.1, 0.1, 0.02]) ** 2, np.diag([0.1, 0.3, 0.02]) ** 2
-KIDNAPPED_UNMAPPED = relocalization.KIDNAPPED_UNMAPPED_PRIOR
+KIDNAPPED_UNMAPPED = pose_verification.KIDNAPPED_UNMAPPED_PRIOR
 
 
 def make_map():

@@ -26,7 +26,7 @@ from hmt_slam_ros.topological_inference.kidnapping import decide_without_mapping
 from hmt_slam_ros.topological_inference.kidnapping_prior import KidnappingPriors
 from hmt_slam_ros.topological_inference.map_search import MapSearch
 from hmt_slam_ros.topological_inference.pose_distribution import UNMAPPED_PRIOR, PoseDistribution
-from hmt_slam_ros.topological_inference.relocalization import KIDNAPPED_UNMAPPED_PRIOR
+from hmt_slam_ros.topological_inference.pose_verification import KIDNAPPED_UNMAPPED_PRIOR
 from hmt_slam_ros.topological_inference.tsbi import Tsbi
 
 FAR, HERE = (30.0, 20.0), (0.0, 0.0)

@@ -24,7 +24,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative, uninformative_belief
 from hmt_slam_ros.messages.map_changes import InitialPose
-from hmt_slam_ros.topological_inference import relocalization, relocalization_arcs
+from hmt_slam_ros.topological_inference import pose_verification, relocalization, relocalization_arcs
 from hmt_slam_ros.topological_inference.branches import Branches
 from hmt_slam_ros.topological_inference.hypothesis_tree import (
     FalseAlarm,
@@ -51,7 +51,7 @@ from hmt_slam_ros.topological_inference.search_prior import PoseHint
 def test_two_poses_are_the_same_within_a_meter_and_15_degrees_in_whatever_areas(offset, is_same):
     hybrid_map, pose = make_map(), np.array([0.4, -0.8, 3.0])
     other = se2.compose(pose, offset)
-    same = relocalization._is_same_place
+    same = pose_verification.is_same_place
     assert same(hybrid_map, PoseInArea(1, 20, pose), PoseInArea(1, 20, other)) is is_same
     assert same(hybrid_map, PoseInArea(0, 20, se2.compose(ARC, pose)), PoseInArea(1, 20, other)) is is_same
     assert same(hybrid_map, PoseInArea(1, 20, pose), PoseInArea(0, 20, se2.compose(ARC, other))) is is_same
@@ -79,7 +79,7 @@ def test_the_bayes_factor_of_a_kidnapping_is_that_of_being_elsewhere_over_having
     # The prior of moved robots is flat over the four areas; staying at new ground has the likelihood 1.
     likelihood = here / unmapped * KIDNAPPED_UNMAPPED / (1.0 - KIDNAPPED_UNMAPPED) * 4
     expected = math.log((unmapped + away) / unmapped * KIDNAPPED_UNMAPPED) - math.log(max(1.0, likelihood))
-    factor = relocalization.log_bayes_factor(make_map(), found, TRACKED, POSES)
+    factor = pose_verification.log_bayes_factor(make_map(), found, TRACKED, POSES)
     assert factor == pytest.approx(expected)
 
 
@@ -89,8 +89,8 @@ def test_the_bayes_factor_of_a_kidnapping_is_that_of_being_elsewhere_over_having
 )
 def test_the_tracked_pose_is_preferred_over_other_candidates_where_most_surfaces_match(here, away, matched, preferred):
     found = distribution((candidate(1, [5.0, 5.0, 0.0], 0.95), away), (candidate(1, at_tracked_pose(1), matched), here))
-    assert relocalization.prefers_tracked_pose(make_map(), found, TRACKED, POSES, OPTIONS) is preferred
-    assert not relocalization.prefers_tracked_pose(make_map(), distribution(), TRACKED, POSES, OPTIONS)
+    assert pose_verification.prefers_tracked_pose(make_map(), found, TRACKED, POSES, OPTIONS) is preferred
+    assert not pose_verification.prefers_tracked_pose(make_map(), distribution(), TRACKED, POSES, OPTIONS)
 
 
 @pytest.mark.parametrize(
@@ -107,14 +107,14 @@ def test_a_search_determines_the_pose_where_it_is_probable_certain_and_matches(
     probability, matched, covariance, mapping, kidnapped
 ):
     each = candidate(1, [2.0, 1.0, 0.4], matched, covariance)
-    decisive = [relocalization._is_decisive(each, probability, OPTIONS, is_kidnapped=k) for k in (False, True)]
+    decisive = [pose_verification.is_decisive(each, probability, OPTIONS, is_kidnapped=k) for k in (False, True)]
     assert decisive == [mapping, kidnapped]
-    found = relocalization.decisive_candidate(distribution((each, probability)), POSES, OPTIONS)
+    found = pose_verification.decisive_candidate(distribution((each, probability)), POSES, OPTIONS)
     assert (found is not None) is kidnapped
     if found is not None:
         assert (found.area, found.keyframe) == (1, 23)
         np.testing.assert_allclose(found.pose, se2.compose([2.0, 1.0, 0.4], POSES[23]))
-    assert relocalization.decisive_candidate(distribution(), POSES, OPTIONS) is None
+    assert pose_verification.decisive_candidate(distribution(), POSES, OPTIONS) is None
 
 
 @pytest.mark.parametrize(
@@ -201,7 +201,7 @@ def test_a_kidnapped_hypothesis_counts_its_evidence_once():
     poses = {k: se2.between(own[21], own[k]) for k in range(21, 26)}
     expected = distribution(pair).with_unmapped_prior(KIDNAPPED_UNMAPPED)
     np.testing.assert_allclose(found.pose_distribution.probabilities, expected.probabilities)
-    evidence = relocalization.log_bayes_factor(parent.hybrid_map, expected, lost.tracked_pose, poses)
+    evidence = pose_verification.log_bayes_factor(parent.hybrid_map, expected, lost.tracked_pose, poses)
     (child,) = found.children
     assert child.log_weight == pytest.approx(-0.7 + evidence - 0.4)
     assert child.state.localization.counted_evidence == pytest.approx(evidence)

@@ -15,7 +15,7 @@ from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.hypothesis_tree import FalseAlarm, Lost, PoseInArea
-from hmt_slam_ros.topological_inference.relocalization import (
+from hmt_slam_ros.topological_inference.pose_verification import (
     KIDNAPPED_UNMAPPED_PRIOR,
     decisive_candidate,
     log_bayes_factor,

@@ -12,47 +12,36 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
-
-from hmt_slam_ros.arrays import Bool, Float64
-from hmt_slam_ros.configuration.topology import InferenceParameters
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
-from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 from hmt_slam_ros.messages.map_changes import Arc, InitialPose
 from hmt_slam_ros.messages.messages import Keyframe
 from hmt_slam_ros.topological_inference.branches import Branches, Child, Parent
 from hmt_slam_ros.topological_inference.branching import Branching
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch
-from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate, is_certain
+from hmt_slam_ros.topological_inference.global_scan_matching import PoseCandidate
 from hmt_slam_ros.topological_inference.hypothesis_tree import Lost, PoseInArea, Tracking
 from hmt_slam_ros.topological_inference.pose_distribution import PoseDistribution
+from hmt_slam_ros.topological_inference.pose_verification import (
+    KIDNAPPED_UNMAPPED_PRIOR,
+    candidates_at,
+    is_decisive,
+    is_same_place,
+    log_bayes_factor,
+    pose_in_area,
+)
 from hmt_slam_ros.topological_inference.relocalization_arcs import hinted_arcs, hinted_pose, refuted_arcs
 from hmt_slam_ros.topological_inference.search_prior import PoseHint, SearchPrior
 
 Pose = Float64
-
-KIDNAPPED_UNMAPPED_PRIOR = 0.5
-"""Prior probability that a robot kidnapped during mapping is on unmapped ground.
-
-From docs/decisions/0026-kidnapping-detection.md.
-"""
-
-_SAME_DISTANCE = 1.0
-"""Largest distance between two poses of a keyframe that count as the same, m."""
-
-_SAME_ANGLE = math.radians(15.0)
-"""Largest difference of their headings, rad."""
 
 _REFUTING_KEYFRAMES = 5
 """Keyframes after which a pose hint can be refuted."""
 
 _REFUTING_PROBABILITY = 0.9
 """Probability that no candidate is right, above which the pose hint is refuted."""
-
-_PROBABILITY_FLOOR = 1e-12
-"""Smallest probability of unmapped ground in a Bayes factor."""
 
 _MARKED_KEYFRAMES = 3
 """Keyframes after which a robot that visits a mark of the map is searched."""
@@ -225,14 +214,14 @@ def _conclude_search(
     parent, lost = _reweight_by_evidence(parent, lost, unmarked, poses)
     lost = _after_refutation(lost, distribution, poses)
     best = distribution.best
-    if best is None or not _is_decisive(*best, branching.options, is_kidnapped=is_kidnapped):
+    if best is None or not is_decisive(*best, branching.options, is_kidnapped=is_kidnapped):
         plausible = branching.map_search.plausible_areas(parent.hybrid_map, distribution)
         children = [_child_with_localization(parent, replace(lost, candidate=None, plausible_areas=plausible))]
         return Branches(children, True, pose_distribution=distribution)
     candidate, probability = best
     with_candidate = replace(
         lost,
-        candidate=_pose_in_area(candidate, poses, max(poses)),
+        candidate=pose_in_area(candidate, poses, max(poses)),
         plausible_areas=branching.map_search.plausible_areas(parent.hybrid_map, distribution),
     )
     if (prior.hint is not None and probability >= branching.options.hint_probability) or _confirms_candidate(
@@ -280,8 +269,8 @@ def _count_kidnapping(
     alarm = lost.false_alarm
     if alarm is None or alarm.tracked_pose.keyframe not in poses:
         return relocalized
-    found = _pose_in_area(candidate, poses, alarm.tracked_pose.keyframe)
-    if _is_same_place(hybrid_map, found, alarm.tracked_pose):
+    found = pose_in_area(candidate, poses, alarm.tracked_pose.keyframe)
+    if is_same_place(hybrid_map, found, alarm.tracked_pose):
         return relocalized
     return replace(relocalized, state=relocalized.state.after_kidnapping(alarm.motion_condition))
 
@@ -326,7 +315,7 @@ def _with_false_alarm(
     alarm = lost.false_alarm
     if alarm is None or alarm.tracked_pose.keyframe not in poses:
         return distribution
-    at_tracked_pose = _candidates_at(hybrid_map, distribution, alarm.tracked_pose, poses)
+    at_tracked_pose = candidates_at(hybrid_map, distribution, alarm.tracked_pose, poses)
     return distribution.with_false_alarm(at_tracked_pose, alarm.probability, len(hybrid_map.area_ids()))
 
 
@@ -355,87 +344,6 @@ def _reweight_by_evidence(
     return reweighted, replace(lost, counted_evidence=evidence)
 
 
-def log_bayes_factor(
-    hybrid_map: HybridMap, distribution: PoseDistribution, tracked_pose: PoseInArea, poses: Mapping[int, Pose]
-) -> float:
-    """log p(scans | kidnapped) / p(scans | not kidnapped), nats, both relative to new ground.
-
-    :param tracked_pose: the pose without a kidnapping; a kidnapped robot is elsewhere.
-    :param poses: {keyframe: ``reference_T_base``} of those that were searched.
-    """
-    probabilities = distribution.probabilities
-    at_tracked_pose = _candidates_at(hybrid_map, distribution, tracked_pose, poses)
-    unmapped = max(1.0 - float(probabilities.sum()), _PROBABILITY_FLOOR)
-    elsewhere = unmapped + float(probabilities[~at_tracked_pose].sum())
-    areas = len(hybrid_map.area_ids())
-    prior_odds = KIDNAPPED_UNMAPPED_PRIOR / (1.0 - KIDNAPPED_UNMAPPED_PRIOR)
-    stayed = float(probabilities[at_tracked_pose].sum()) / unmapped * prior_odds * areas
-    return math.log(elsewhere / unmapped * KIDNAPPED_UNMAPPED_PRIOR) - math.log(max(1.0, stayed))
-
-
-def prefers_tracked_pose(
-    hybrid_map: HybridMap,
-    distribution: PoseDistribution,
-    tracked_pose: PoseInArea,
-    poses: Mapping[int, Pose],
-    options: InferenceParameters,
-) -> bool:
-    """Whether the tracked pose is more probable than all other candidates, and most surfaces are known there.
-
-    Unmapped ground is no alternative here, since any contradiction speaks for it.
-
-    :param poses: {keyframe: ``reference_T_base``} of those that were searched.
-    """
-    probabilities = distribution.probabilities
-    at_tracked_pose = _candidates_at(hybrid_map, distribution, tracked_pose, poses)
-    known_share = max(
-        (c.agreement.matched_share for c, there in zip(distribution.candidates, at_tracked_pose, strict=True) if there),
-        default=0.0,
-    )
-    is_preferred = probabilities[at_tracked_pose].sum() > probabilities[~at_tracked_pose].sum()
-    return known_share >= options.relocalization_share and bool(is_preferred)
-
-
-def _candidates_at(
-    hybrid_map: HybridMap, distribution: PoseDistribution, pose: PoseInArea, poses: Mapping[int, Pose]
-) -> Bool:
-    """Which candidates are at a pose, shape (len(distribution.candidates),)."""
-    found = [
-        _is_same_place(hybrid_map, _pose_in_area(candidate, poses, pose.keyframe), pose)
-        for candidate in distribution.candidates
-    ]
-    return np.array(found, dtype=np.bool_)
-
-
-def decisive_candidate(
-    distribution: PoseDistribution, poses: Mapping[int, Pose], options: InferenceParameters
-) -> PoseInArea | None:
-    """The pose that a search found for a robot kidnapped during mapping, or None.
-
-    :param poses: {keyframe: ``reference_T_base``} of those that were searched.
-    """
-    best = distribution.best
-    if best is None or not _is_decisive(*best, options, is_kidnapped=True):
-        return None
-    return _pose_in_area(best[0], poses, max(poses))
-
-
-def _is_decisive(
-    candidate: PoseCandidate, probability: float, options: InferenceParameters, *, is_kidnapped: bool
-) -> bool:
-    """Whether a search determines the pose.
-
-    :param is_kidnapped: whether the robot was kidnapped during mapping.
-    """
-    min_share = options.relocalization_share if is_kidnapped else 0.0
-    is_probable = probability >= options.relocalization_probability
-    return is_probable and candidate.agreement.matched_share >= min_share and is_certain(candidate)
-
-
-def _pose_in_area(candidate: PoseCandidate, poses: Mapping[int, Pose], keyframe: int) -> PoseInArea:
-    return PoseInArea(candidate.area, keyframe, se2.compose(candidate.mode.pose.mean, poses[keyframe]))
-
-
 def _confirms_candidate(hybrid_map: HybridMap, lost: Lost, candidate: PoseCandidate, poses: Mapping[int, Pose]) -> bool:
     """Whether the last search found the same pose.
 
@@ -446,17 +354,7 @@ def _confirms_candidate(hybrid_map: HybridMap, lost: Lost, candidate: PoseCandid
     before = lost.candidate
     if before is None or before.keyframe not in poses:
         return False
-    return _is_same_place(hybrid_map, _pose_in_area(candidate, poses, before.keyframe), before)
-
-
-def _is_same_place(hybrid_map: HybridMap, one: PoseInArea, other: PoseInArea) -> bool:
-    """Whether two poses of a keyframe are about the same."""
-    frames = shortest_path_beliefs(hybrid_map, one.area, targets=(other.area,))
-    if other.area not in frames:
-        return False
-    difference = se2.between(one.pose, se2.compose(frames[other.area].mean, other.pose))
-    is_near = math.hypot(difference[0], difference[1]) <= _SAME_DISTANCE
-    return bool(is_near and abs(difference[2]) <= _SAME_ANGLE)
+    return is_same_place(hybrid_map, pose_in_area(candidate, poses, before.keyframe), before)
 
 
 def _poses_since(parent: Parent, keyframe: int) -> dict[int, Pose]:
