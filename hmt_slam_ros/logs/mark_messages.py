@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, rotate_covariance
 from hmt_slam_ros.logs.mounting import frame_name, heading_from_quaternion
+from hmt_slam_ros.logs.planar_covariance import planar_covariance, spatial_covariance
 from hmt_slam_ros.logs.ros_types import RosMessage
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.sensors import MarkObservation
 from hmt_slam_ros.sensors.mark import check_mark
 from hmt_slam_ros.sensors.plausibility import check_quaternion
-
-_PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
-"""Rows and columns of x, y and yaw in a covariance of a message."""
 
 
 def mark_from_message(message: RosMessage) -> MarkObservation:
@@ -27,14 +26,12 @@ def mark_from_message(message: RosMessage) -> MarkObservation:
     quaternion = (rotation.x, rotation.y, rotation.z, rotation.w)
     check_quaternion(quaternion)
     mean = np.array([position.x, position.y, heading_from_quaternion(quaternion)])
-    covariance = np.reshape(message.pose.covariance, (6, 6))[_PLANAR]
+    covariance = planar_covariance(message.pose.covariance)
     stamp = int(header.stamp.sec * NANOSECONDS + header.stamp.nanosec)
-    belief = PoseGaussian(mean, rotate_covariance(np.ascontiguousarray(covariance, np.float64), -float(mean[2])))
+    belief = PoseGaussian(mean, rotate_covariance(covariance, -float(mean[2])))
     return check_mark(MarkObservation(stamp, frame_name(header.frame_id), belief))
 
 
-def message_covariance(belief: PoseGaussian) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def message_covariance(belief: PoseGaussian) -> NDArray[np.float64]:
     """The covariance of a belief in a message, shape (36,)."""
-    covariance = np.zeros((6, 6))
-    covariance[_PLANAR] = rotate_covariance(belief.covariance, float(belief.mean[2]))
-    return covariance.ravel()
+    return spatial_covariance(rotate_covariance(belief.covariance, float(belief.mean[2])))

@@ -33,6 +33,7 @@ from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, MultiAr
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs.mounting import heading_from_quaternion
+from hmt_slam_ros.logs.planar_covariance import planar_covariance, spatial_covariance
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.messages import ScanPoses
 from hmt_slam_ros.sensors import MarkObservation, Odometry, Scan
@@ -46,8 +47,6 @@ from hmt_slam_ros.sensors.plausibility import (
 )
 from hmt_slam_ros.untrusted_input import shorten
 
-_PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
-"""Rows and columns of (x, y, theta) in the 6 x 6 covariance of ROS, which is (x, y, z, roll, pitch, yaw)."""
 _NUDGES = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (2, 0), (-2, 0), (0, 2), (0, -2))
 """Corrections of (z, w) of a quaternion that are tried, units in the last place, the smallest first."""
 _SCAN_POSES_FRAME = re.compile(r"hypothesis_(\d{1,18})/scan_(\d{1,18})(?:/system_(.{1,100}))?")
@@ -172,11 +171,10 @@ def pose_with_covariance_message(stamp: int, frame: str, belief: PoseGaussian) -
     The covariance of a ``PoseGaussian`` is in the right tangent frame, along the robot's axes.
     """
     axes = _rotation(belief.mean[2])
-    covariance = np.zeros((6, 6))
-    covariance[_PLANAR] = axes @ belief.covariance @ axes.T
+    covariance = spatial_covariance(axes @ belief.covariance @ axes.T)
     return PoseWithCovarianceStamped(
         header=header_message(stamp, frame),
-        pose=PoseWithCovariance(pose=pose_message(belief.mean), covariance=covariance.ravel()),
+        pose=PoseWithCovariance(pose=pose_message(belief.mean), covariance=covariance),
     )
 
 
@@ -187,7 +185,7 @@ def gaussian_from_message(message: PoseWithCovariance) -> PoseGaussian:
     """
     mean = pose_from_message(message.pose)
     axes = _rotation(mean[2])
-    return PoseGaussian(mean, axes.T @ np.reshape(message.covariance, (6, 6))[_PLANAR] @ axes)
+    return PoseGaussian(mean, axes.T @ planar_covariance(message.covariance) @ axes)
 
 
 def mark_from_message(message: PoseWithCovarianceStamped) -> MarkObservation:
