@@ -7,7 +7,7 @@ import pytest
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.sensors import Odometry, Scan
-from hmt_slam_ros.sensors.plausibility import check_odometry, check_quaternion, check_scan
+from hmt_slam_ros.sensors.plausibility import check_odometry, check_quaternion, check_scan, find_invalid_covariance
 
 SCAN = Scan(10**18, np.ones(181, dtype=np.float32), -1.5, 0.0175, 0.1, 30.0)
 
@@ -76,3 +76,28 @@ def test_what_is_no_rotation_is_refused(quaternion):
 
 def test_a_rotation_in_float32_passes():
     check_quaternion(tuple(np.array([0.0, 0.0, np.sin(0.3), np.cos(0.3)], dtype=np.float32).tolist()))
+
+
+TILTED = np.array([[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        -TILTED,
+        TILTED + np.triu(np.full((3, 3), 2e-6), 1),
+        np.diag([1.0, 1.0, -2e-6]),
+        np.diag([1.0, 1.0, np.nan]),
+        np.diag([1.0, 1.0, np.inf]),
+        np.diag([1.0, 1.0, 1.01e14]),
+    ],
+)
+def test_the_matrix_that_is_no_covariance_is_found_among_others(matrix):
+    assert find_invalid_covariance(np.array([TILTED, 1e6 * TILTED, matrix, TILTED])) == 2
+
+
+def test_a_covariance_may_be_singular_up_to_rounding_unless_a_variance_is_wanted():
+    rounded = np.array([np.zeros((3, 3)), np.diag([1.0, 1.0, -5e-7]), TILTED + np.triu(np.full((3, 3), 5e-7), 1)])
+    assert find_invalid_covariance(rounded) is None
+    assert find_invalid_covariance(np.diag([1.0, 1.0, 1e-12])[None], 1e-12) is None
+    assert find_invalid_covariance(np.diag([1.0, 1.0, 9e-13])[None], 1e-12) == 0

@@ -47,7 +47,7 @@ from hmt_slam_ros.messages.team import (
 from hmt_slam_ros.plain_data import field_names, is_record
 from hmt_slam_ros.process_table import participant_names
 from hmt_slam_ros.sensors.mark import MarkObservation, check_mark
-from hmt_slam_ros.sensors.plausibility import MAX_COORDINATE, check_scan
+from hmt_slam_ros.sensors.plausibility import COVARIANCE_FORM, MAX_COORDINATE, check_scan, find_invalid_covariance
 
 Document = TypeVar("Document")
 
@@ -57,11 +57,8 @@ MAX_REACH = 10_000
 MAX_RESET_AHEAD = 86_400_000_000_000
 """Time by which the number of a request, the time of slam's clock, may be ahead of this node's, ns."""
 
-MAX_VARIANCE = MAX_COORDINATE**2
-"""Magnitude of an element of a covariance, m^2 and rad^2."""
-
 _TOLERANCE = 1e-6
-"""Relative rounding of a covariance, and absolute of a sum of probabilities."""
+"""Rounding of a sum of probabilities."""
 
 _TEAM_NAME = re.compile(r"[\w.:+-]{1,100}", re.ASCII)
 _REMEDY = "look for a second system or a stranger in this ROS domain, and give each system its own"
@@ -246,15 +243,9 @@ def _walk(message: object) -> Iterator[tuple[str, object]]:
 def _check_covariances(matrices: list[NDArray[np.float64]], name: str = "a covariance") -> None:
     if not matrices:
         return
-    stack = np.array(matrices)
-    scale = np.abs(stack).max(axis=(1, 2), initial=0.0)
-    wanted = "symmetric, positive definite and within 1e14"
-    worst = matrices[int(np.argmax(np.where(np.isfinite(scale), scale, np.inf)))].tolist()
-    _require(bool((scale <= MAX_VARIANCE).all()), name, worst, wanted)
-    asymmetry = np.abs(stack - stack.transpose(0, 2, 1)).max(axis=(1, 2))
-    smallest = np.linalg.eigvalsh(stack)[:, 0]
-    bad = (asymmetry > _TOLERANCE * scale) | (smallest < -_TOLERANCE * scale)
-    _require(not bad.any(), name, matrices[int(np.argmax(bad))].tolist(), wanted)
+    invalid = find_invalid_covariance(np.array(matrices))
+    if invalid is not None:
+        _require(False, name, matrices[invalid].tolist(), COVARIANCE_FORM)
 
 
 def _check_hypotheses(message: Hypotheses) -> None:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
-from hmt_slam_ros.sensors.plausibility import MAX_COORDINATE, MAX_STAMP, check_planar_pose
+from hmt_slam_ros.sensors.plausibility import (
+    COVARIANCE_FORM,
+    MAX_COORDINATE,
+    MAX_STAMP,
+    check_planar_pose,
+    find_invalid_covariance,
+)
 from hmt_slam_ros.untrusted_input import shorten
 
 MAX_NAME_LENGTH = 100
@@ -20,9 +24,6 @@ MAX_HEADING_DEVIATION = 0.5
 
 _MIN_VARIANCE = 1e-12
 """Smallest variance along any direction, m^2 and rad^2."""
-
-_TOLERANCE = 1e-6
-"""Largest asymmetry of a covariance, as a share of its largest element."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,13 +50,8 @@ def check_mark(observation: MarkObservation) -> MarkObservation:
     is_name = 0 < len(name) <= MAX_NAME_LENGTH and name.isprintable()
     _require(is_name, "frame_id", shorten(name), f"the name of a mark, of 1 to {MAX_NAME_LENGTH} characters")
     check_planar_pose(observation.pose.mean, "pose", MAX_COORDINATE)
-    wanted = "symmetric, positive definite and within 1e14"
-    is_finite = bool(np.isfinite(covariance).all()) and float(np.abs(covariance).max()) <= MAX_COORDINATE**2
-    _require(is_finite, "covariance", covariance.tolist(), wanted)
-    asymmetry = float(np.abs(covariance - covariance.T).max())
-    least = float(np.linalg.eigvalsh(covariance)[0])
-    is_covariance = asymmetry <= _TOLERANCE * float(np.abs(covariance).max()) and least >= _MIN_VARIANCE
-    _require(is_covariance, "covariance", covariance.tolist(), wanted)
+    is_covariance = find_invalid_covariance(covariance[None], _MIN_VARIANCE) is None
+    _require(is_covariance, "covariance", covariance.tolist(), COVARIANCE_FORM)
     deviation = math.sqrt(covariance[2, 2])
     wanted = f"a deviation of the heading of at most {MAX_HEADING_DEVIATION:g} rad"
     _require(deviation <= MAX_HEADING_DEVIATION, "covariance", f"{deviation:.3g} rad", wanted)

@@ -1,4 +1,4 @@
-"""What a scan and an odometry reading have to be before any process sees them.
+"""What a scan, an odometry reading and a covariance have to be before any process sees them.
 
 Drivers send NaN, infinities and zero angles, logs are damaged, clocks run wild. Such a measurement is refused with the
 value and the remedy, the same in the readers of logs and on the topics; the rest of the log or drive goes on.
@@ -34,8 +34,17 @@ MAX_LASER_OFFSET = 100.0
 MAX_COORDINATE = 1e7
 """m from the origin of the odometry, beyond any drive; a float64 keeps 2 nm there."""
 
+MAX_VARIANCE = MAX_COORDINATE**2
+"""Magnitude of an element of a covariance, m^2 and rad^2."""
+
+COVARIANCE_FORM = "symmetric, positive definite and within 1e14"
+"""What a covariance has to be, as the sentence says that refuses one."""
+
 MAX_STAMP = 2**62
 """ns, in the year 2116; beyond it sums of stamps no longer fit into 64 bits."""
+
+_COVARIANCE_TOLERANCE = 1e-6
+"""Rounding of a covariance, as a share of its largest element."""
 
 QUATERNION_TOLERANCE = 1e-2
 """By which the norm of a rotation's quaternion may differ from 1; float32 differs by 1e-7."""
@@ -94,6 +103,22 @@ def check_quaternion(quaternion: Sequence[float], name: str = "orientation") -> 
     """
     norm = math.hypot(*quaternion) if all(map(math.isfinite, quaternion)) else math.nan
     _require(abs(norm - 1.0) <= QUATERNION_TOLERANCE, name, tuple(quaternion), "a quaternion of norm 1")
+
+
+def find_invalid_covariance(matrices: NDArray[np.float64], min_variance: float | None = None) -> int | None:
+    """The index of a matrix that is no covariance, None where all are: ``COVARIANCE_FORM``.
+
+    :param matrices: shape (n, k, k), n of 1 or more.
+    :param min_variance: smallest along any direction; None where it may be 0, or below by rounding.
+    """
+    scale = np.abs(matrices).max(axis=(1, 2), initial=0.0)
+    if not (scale <= MAX_VARIANCE).all():
+        return int(np.argmax(np.where(np.isfinite(scale), scale, np.inf)))
+    asymmetry = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2))
+    smallest = np.linalg.eigvalsh(matrices)[:, 0]
+    least = -_COVARIANCE_TOLERANCE * scale if min_variance is None else min_variance
+    invalid = (asymmetry > _COVARIANCE_TOLERANCE * scale) | (smallest < least)
+    return int(np.argmax(invalid)) if invalid.any() else None
 
 
 def _check_stamp(stamp: int) -> None:
