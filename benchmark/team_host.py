@@ -22,47 +22,23 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
+from benchmark.recorded_chain import ChainPublisher, record_chain
 from benchmark.runs import PARAMETERS
 from hmt_slam_ros.configuration import load_configuration
-from hmt_slam_ros.messages.documents import KeyframeHeader, decode, encode
-from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message
+from hmt_slam_ros.messages.documents import decode
+from hmt_slam_ros.messages.messages import Message
 from hmt_slam_ros.messages.team import TeamPlacement, TeamStatus
-from hmt_slam_ros.offline.lock_step import LockStepRun
-from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.process_table import TEAM, node_command
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import keyframe_frame, scan_message
-from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAME_SCANS, KEYFRAMES
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS
 
 _DOMAIN = 7
 _SPIN = 0.01  # s
 _PERIOD = 1.0  # s
 _INTERVAL = 0.02
 """Time between two messages of the chain, s."""
-
-
-class _Chain:
-    """Keeps the messages of the chain."""
-
-    def __init__(self) -> None:
-        self.messages: list[Message] = []
-
-    def handle(self, message: Message) -> list[Message]:
-        """Keep a message."""
-        self.messages.append(message)
-        return []
-
-
-def chain_of(world: str, lap: int) -> list[Message]:
-    """What the process team of a robot receives that drives one of two laps."""
-    chain, half = _Chain(), 0.5 * open_log(world).duration
-    run = LockStepRun(load_configuration(PARAMETERS, []), observers={TEAM.name: chain})
-    for record in run.unread_records(open_log(world, start=lap * half, duration=half)):
-        run.process_record(record)
-    return chain.messages
 
 
 class _Host:
@@ -81,11 +57,7 @@ class _Host:
         self._node = Node("chain", context=context, namespace=name)
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self._node)
-        types = {KEYFRAMES: String, KEYFRAME_SCANS: LaserScan}
-        types |= {DOCUMENTS[kind]: String for kind in (Hypotheses, ClosureDecision)}
-        self._publishers = {
-            topic: self._node.create_publisher(kind, topic, topics.CHAIN_HISTORY) for topic, kind in types.items()
-        }
+        self._chain = ChainPublisher(self._node, name)
         self._node.create_subscription(String, DOCUMENTS[TeamStatus], self._on_status, topics.TEAM_HISTORY)
         self._node.create_subscription(String, DOCUMENTS[TeamPlacement], self._on_placement, topics.TEAM_HISTORY)
         self._node.create_subscription(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics, topics.STREAM)
@@ -152,17 +124,8 @@ class _Host:
         if self._played == self._until or time.monotonic() < self._next_at:
             return
         self._next_at = time.monotonic() + _INTERVAL
-        message = self._messages[self._played]
+        self._chain.publish(self._messages[self._played])
         self._played += 1
-        if isinstance(message, Keyframe):
-            frame = keyframe_frame(message.sequence, 0, self._name)
-            self._publishers[KEYFRAME_SCANS].publish(scan_message(message.scan, frame))
-            self._publish(KEYFRAMES, KeyframeHeader.from_keyframe(message))
-        else:
-            self._publish(DOCUMENTS[type(message)], message)
-
-    def _publish(self, topic: str, document: object) -> None:
-        self._publishers[topic].publish(String(data=encode(document, system=self._name)))
 
     def _report(self) -> dict[str, object]:
         return {
@@ -188,7 +151,8 @@ def _read_commands(commands: queue.SimpleQueue[list[str]]) -> None:
 def main() -> None:
     """Run a robot until its commands end."""
     name, world, lap, folder = sys.argv[1:]
-    _Host(name, chain_of(world, int(lap)), Path(folder)).serve()
+    messages = record_chain(load_configuration(PARAMETERS, []), world, int(lap))
+    _Host(name, messages, Path(folder)).serve()
 
 
 if __name__ == "__main__":

@@ -10,14 +10,13 @@ import pytest
 pytest.importorskip("rclpy", reason="the nodes need ROS 2: run scripts/test.sh, which installs it")
 
 from diagnostic_msgs.msg import DiagnosticArray
-from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
+from benchmark.recorded_chain import ChainPublisher, record_chain
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.messages.documents import KeyframeHeader, decode, encode
-from hmt_slam_ros.messages.messages import Keyframe
+from hmt_slam_ros.messages.documents import decode, encode
 from hmt_slam_ros.messages.team import (
     SharedArea,
     TeamPlacement,
@@ -26,36 +25,18 @@ from hmt_slam_ros.messages.team import (
     TeamUpdate,
     Verdict,
 )
-from hmt_slam_ros.offline.lock_step import LockStepRun
-from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
 from hmt_slam_ros.ros import topics
-from hmt_slam_ros.ros.conversions import keyframe_frame, scan_message
-from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS, KEYFRAME_SCANS, KEYFRAMES
+from hmt_slam_ros.ros.topics import DIAGNOSTICS, DOCUMENTS
 
 OFFICE, OTHER = "sim:office,size=0.7,seed=51", "sim:office,size=0.7,seed=50"
 SEED = {"seed": 50}
 
 
-class _Chain:
-    """Keeps the messages of the chain."""
-
-    def __init__(self):
-        self.messages = []
-
-    def handle(self, message):
-        self.messages.append(message)
-        return []
-
-
 @cache
 def chain(world, lap):
     """The messages of the chain of a robot that drives one of two laps."""
-    observer, half = _Chain(), 0.5 * open_log(world).duration
-    run = LockStepRun(Configuration(**SEED), observers={"team": observer})
-    for record in run.unread_records(open_log(world, start=lap * half, duration=half)):
-        run.process_record(record)
-    return observer.messages
+    return record_chain(Configuration(**SEED), world, lap)
 
 
 class Robot:
@@ -63,14 +44,7 @@ class Robot:
 
     def __init__(self, name, start, listener, **parameters):
         self.name, self.listener, self._start, self._parameters = name, listener, start, parameters
-        kinds = {KEYFRAMES: String, KEYFRAME_SCANS: LaserScan}
-        kinds |= {
-            topic: String for kind, topic in DOCUMENTS.items() if kind.__name__ in ("Hypotheses", "ClosureDecision")
-        }
-        self._publishers = {
-            topic: listener.node.create_publisher(kind, f"/{name}/{topic}", topics.CHAIN_HISTORY)
-            for topic, kind in kinds.items()
-        }
+        self._chain = ChainPublisher(listener.node, name)
         self.transforms = listener.subscribe(TFMessage, f"/{name}/tf", topics.STREAM)
         self._reports = listener.subscribe(DiagnosticArray, f"/{name}/{DIAGNOSTICS}", topics.STREAM)
         self.start()
@@ -81,15 +55,7 @@ class Robot:
 
     def play(self, messages):
         for message in messages:
-            if isinstance(message, Keyframe):
-                frame = keyframe_frame(message.sequence, 0, self.name)
-                self._publishers[KEYFRAME_SCANS].publish(scan_message(message.scan, frame))
-                self._publish(KEYFRAMES, KeyframeHeader.from_keyframe(message))
-            else:
-                self._publish(DOCUMENTS[type(message)], message)
-
-    def _publish(self, topic, document):
-        self._publishers[topic].publish(String(data=encode(document, system=self.name)))
+            self._chain.publish(message)
 
     @property
     def values(self):
