@@ -64,7 +64,7 @@ def measure_cost(lattice: Lattice, configuration: Configuration, steps: int = _S
     """
     known, search = _component(lattice), PlacementSearch(configuration)
     update, _ = _measure_time(lambda: search.update(combine(known, _component(lattice))))
-    spent, done = _measure_time(lambda: next((n for n in range(steps) if not search.step()), steps))
+    spent, done = _measure_time(lambda: next((n for n in range(steps) if search.step() is None), steps))
     comparison, _ = _measure_time(search.distribution)
     return TeamCost(lattice.areas, len(search.windows), update, spent / max(1, done), comparison)
 

@@ -37,7 +37,7 @@ def part(component, share, first=0.0):
 def finish(search):
     """Take all steps; their number."""
     count = 0
-    while search.step():
+    while search.step() is not None:
         count += 1
     return count
 
@@ -109,7 +109,7 @@ def test_a_step_that_is_open_leaves_its_share_to_what_was_not_searched():
     search = PlacementSearch(CONFIGURATION)
     search.update(combine(lap(0), lap(1), SHIFT))
     assert judge(search, CONFIGURATION).verdict is Verdict.APART
-    assert search.step()
+    assert search.step() is not None
 
 
 def test_pruned_keyframes_end_their_window_alone():

@@ -58,7 +58,7 @@ def meet(first: Component, second: Component, configuration: Configuration) -> M
     first, second = add_repetition(first, configuration), add_repetition(second, configuration)
     pair, search = combine(first, second), PlacementSearch(configuration)
     search.update(pair)
-    while search.step():
+    while search.step() is not None:
         pass
     return judge(search, configuration)
 

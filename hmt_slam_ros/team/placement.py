@@ -290,9 +290,10 @@ def _grow_placements(
 ) -> list[_Growth]:
     """The placements of the candidates with the most evidence.
 
-    One that a better candidate of an earlier placement agrees with is that placement, with a window explained worse.
+    Those that fit no better than unmapped ground make none. One that a better candidate of an earlier placement agrees
+    with is that placement, with a window explained worse.
     """
-    seeds = [(w, n) for w, own in enumerate(candidates) for n in range(len(own))]
+    seeds = [(w, n) for w, own in enumerate(candidates) for n, each in enumerate(own) if each.log_ratio > 0.0]
     seeds.sort(key=lambda seed: -candidates[seed[0]][seed[1]].log_ratio)
     locations = [_Locations.of_candidates(geometry, own) for own in candidates]
     grown: list[_Growth] = []

@@ -123,8 +123,8 @@ class PlacementSearch:
         searches = [own.search for own in self._searches.values() if own.search is not None]
         return sum(search.areas - len(search.unexamined) for search in searches)
 
-    def step(self) -> bool:
-        """Take the next step, of the work of an event; whether there was one."""
+    def step(self) -> int | None:
+        """Take the next step: its work, at most about that of an event; None where nothing is left."""
         hybrid_map = self.pair.hybrid_map
         for key, earlier in self._searches.items():
             window = self._outdated.pop(key, None)
@@ -138,8 +138,8 @@ class PlacementSearch:
             else:
                 search, is_checked = self._map_search.check_candidates(hybrid_map, own.search, self.pair.clutter)
                 self._searches[key] = replace(own, search=search, is_checked=is_checked)
-            return True
-        return False
+            return self._work.done
+        return None
 
     def distribution(self, left_out: int = 0) -> PlacementDistribution:
         """The PMF over placements, as far as it was searched.

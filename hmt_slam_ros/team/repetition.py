@@ -55,10 +55,12 @@ class RepetitionTest:
         self._search.update(combine(component, component, shift))
         self.is_done = False
 
-    def step(self) -> None:
-        """Take the next step, of the work of an event; at the end ``log_ratio`` is new."""
-        if not self._search.step():
+    def step(self) -> int:
+        """Take the next step, and return its work; at the end ``log_ratio`` is new."""
+        work = self._search.step()
+        if work is None:
             self.log_ratio, self.is_done = _log_ratio(self._search), True
+        return work or 0
 
 
 def add_repetition(component: Component, configuration: Configuration) -> Component:

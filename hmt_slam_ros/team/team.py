@@ -39,8 +39,8 @@ _SHIFT = Shift(MAX_TEAM_AREAS, MAX_TEAM_KEYFRAMES)
 _MIN_GROWTH = 16
 """New keyframes of both robots after which their maps are compared again, unless the robots stand."""
 
-_STEPS = 8
-"""Steps of the search after an event, of 30 ms each: they bound its work."""
+_WORK = 160_000_000
+"""Work of the search after an event, about 240 ms: it is that of eight keyframe events."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +187,7 @@ class Team:
         """Follow the robot's map; a decision is shared."""
         if isinstance(message, ClosureDecision):
             self._replica.apply_decision(message)
-            return [*self._share(), *self.search(_STEPS)]
+            return [*self._share(), *self.search(_WORK)]
         self._replica.apply_message(message)
         if isinstance(message, Keyframe):
             self._note_clutter(message)
@@ -218,7 +218,7 @@ class Team:
         """
         name = status.robot
         if name == self._robot:
-            return self.search(_STEPS, may_wait=False)
+            return self.search(_WORK, may_wait=False)
         if name not in self._others and len(self._others) == MAX_ROBOTS:
             return []
         known = self._others.get(name)
@@ -283,27 +283,28 @@ class Team:
         self._placements = {key: each for key, each in self._placements.items() if name not in key}
         self.map_poses = team_poses(self._robot, self._placements.values())
 
-    def search(self, steps: int, *, may_wait: bool = True) -> list[Message]:
-        """Go on with the search for some steps; placements where the answer changed.
+    def search(self, work: int, *, may_wait: bool = True) -> list[Message]:
+        """Go on with the search until so much work is done; placements where the answer changed.
 
         :param may_wait: whether a search may wait until the maps have grown some more.
         """
         growth = _MIN_GROWTH if may_wait else 0
-        answers, steps = self._test_repetition(steps, growth)
+        answers, work = self._test_repetition(work, growth)
         for name, pair in sorted(self._pairs.items()):
             # A search ends with the maps with which it began: maps that grow would put its end off again and again.
             if pair.is_outdated and pair.is_judged:
                 self._update(name, pair, growth)
-            while steps > 0 and not pair.is_judged:
-                steps -= 1
-                if not pair.search.step():
+            while work > 0 and not pair.is_judged:
+                done = pair.search.step()
+                if done is None:
                     answers += self._judge(name, pair)
+                work -= done or 0
         return answers
 
-    def _test_repetition(self, steps: int, growth: int) -> tuple[list[Message], int]:
+    def _test_repetition(self, work: int, growth: int) -> tuple[list[Message], int]:
         """Go on with the search of the own map in itself, if there is another robot, and it has grown enough.
 
-        :returns: the status where the evidence is new, and how many of the steps are left.
+        :returns: the status where the evidence is new, and how much of the work is left.
         """
         own, test = self._own, self._repetition
         grown = own.scan_count - self._tested_keyframes
@@ -311,15 +312,14 @@ class Team:
             self._tested_version, self._tested_keyframes = own.version, own.scan_count
             if own.scan_count:
                 test.update(own.component(), _SHIFT)
-        while steps > 0 and not test.is_done:
-            steps -= 1
-            test.step()
+        while work > 0 and not test.is_done:
+            work -= test.step()
         if not test.is_done or test.log_ratio == own.log_repetition:
-            return [], steps
+            return [], work
         own.log_repetition = test.log_ratio
         for pair in self._pairs.values():
             pair.is_outdated = True
-        return [self.status], steps
+        return [self.status], work
 
     @property
     def _is_untested(self) -> bool:
