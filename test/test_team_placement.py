@@ -66,7 +66,7 @@ def distribution(geometry, candidates, compare=no_contradictions, log_repetition
 
 def odds(found):
     """Log-odds of each placement to the prior weight of all that is not one of them."""
-    prior = 0.5 / PlacementPrior.of_pair(AREAS, WINDOWS).possible
+    prior = 0.5 / PlacementPrior.of_pair(AREAS, WINDOWS).places
     rest = math.log(found.apart / (1.0 - prior * len(found.placements)))
     return [math.log(each.probability / prior) - rest for each in found.placements]
 
@@ -75,6 +75,24 @@ def test_components_without_a_candidate_are_apart():
     geometry, _ = two_rows()
     found = distribution(geometry, [[], [], []])
     assert found.best is None and found.apart == 1.0
+
+
+def test_a_candidate_that_fits_no_better_than_unmapped_ground_is_no_placement():
+    geometry, windows = two_rows()
+    other = np.array([-40.0, 3.0, -2.0])
+    candidates = [[match(windows, 0, 4.0), match(windows, 0, -0.1, placement=other)], [match(windows, 1, -2.0)], []]
+    found = distribution(geometry, candidates)
+    assert len(found.placements) == 1
+    assert list(found.best.matches) == [0]
+    # Of the placement that there is, it is evidence.
+    assert found.best.evidence.agreement < 0.0
+
+
+def test_windows_on_other_ground_leave_the_probability_of_a_placement():
+    geometry, windows = two_rows()
+    candidates = [[match(windows, 0, 4.0)], [match(windows, 1, 4.0)], []]
+    alone = distribution(geometry, candidates[:2]).best.probability
+    assert distribution(geometry, candidates).best.probability == pytest.approx(alone)
 
 
 def test_windows_that_agree_are_one_placement():

@@ -43,8 +43,8 @@ Pose = Float64
 APART_PRIOR = 0.5
 """Prior probability that two components show no common ground, or none by which they could be joined."""
 
-UNSEEN_AREAS = 2
-"""Areas of a building that a component lacks, a priori: robots that begin in it are rarely at one place."""
+_UNSEEN_AREAS = 8
+"""Areas of a building that no component has, a priori: robots that begin in it are rarely at one place."""
 
 _REPETITION_PRIOR = 0.003
 """Prior odds of a building that repeats itself, so that ground has a twin (docs/decisions/0085-repetition.md)."""
@@ -91,23 +91,23 @@ class WindowCandidate(NamedTuple):
 class PlacementPrior(NamedTuple):
     """What is known of placements before any window was compared.
 
-    :ivar possible: number of placements over which the prior is flat.
+    :ivar places: number of areas of the building, in each of which the second component may begin.
     :ivar twin: probability of a building that repeats itself, so that ground of the first component has a twin.
     """
 
-    possible: int
+    places: int
     twin: float
 
     @classmethod
-    def of_pair(cls, known_areas: int, windows: int, log_repetition: float = 0.0) -> PlacementPrior:
-        """The prior that is flat over the areas of a building for each window.
+    def of_pair(cls, known_areas: int, other_areas: int, log_repetition: float = 0.0) -> PlacementPrior:
+        """The prior that is flat over a building that is as large as both components together, and unseen areas.
 
         :param known_areas: number of areas of the first component.
-        :param windows: number of windows of the second.
+        :param other_areas: number of areas of the second.
         :param log_repetition: log Bayes factor of a building that repeats itself, nats.
         """
         odds = _REPETITION_PRIOR * math.exp(log_repetition)
-        return cls((known_areas + UNSEEN_AREAS) * max(1, windows), odds / (1.0 + odds))
+        return cls(known_areas + other_areas + _UNSEEN_AREAS, odds / (1.0 + odds))
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +260,7 @@ def placement_distribution(
     :param candidates: of each window.
     :param joint: areas of the first and of the second component whose frames are those of the components.
     """
-    grown = _grow_placements(geometry, candidates, min(prior.possible, _MAX_PLACEMENTS))
+    grown = _grow_placements(geometry, candidates)
     windows = [_window_evidence(geometry, each, compare) for each in grown]
     placements = []
     for n, (each, own) in enumerate(zip(grown, windows, strict=True)):
@@ -276,18 +276,16 @@ def weigh_placements(placements: Sequence[Placement], prior: PlacementPrior) -> 
 
     Where the building repeats itself, a twin of the ground that the first component has explains a placement as well.
     """
-    share = (1.0 - APART_PRIOR) / prior.possible
+    share = (1.0 - APART_PRIOR) / prior.places
     false_agreement = sorted([0.0, 0.0, *(each.evidence.agreement for each in placements)])[-2]
     logs = np.array([math.log(share) + sum(each.evidence) - false_agreement for each in placements])
-    apart = np.append(logs + math.log(prior.twin), math.log(1.0 - share * len(placements)))
+    apart = np.append(logs + math.log(prior.twin), math.log(max(APART_PRIOR, 1.0 - share * len(placements))))
     weights = scipy.special.softmax(np.append(logs, scipy.special.logsumexp(apart))).tolist()
     weighed = [replace(each, probability=p) for each, p in zip(placements, weights[:-1], strict=True)]
     return PlacementDistribution(tuple(sorted(weighed, key=lambda each: -each.probability)), weights[-1])
 
 
-def _grow_placements(
-    geometry: PlacementGeometry, candidates: Sequence[Sequence[WindowCandidate]], count: int
-) -> list[_Growth]:
+def _grow_placements(geometry: PlacementGeometry, candidates: Sequence[Sequence[WindowCandidate]]) -> list[_Growth]:
     """The placements of the candidates with the most evidence.
 
     Those that fit no better than unmapped ground make none. One that a better candidate of an earlier placement agrees
@@ -299,7 +297,7 @@ def _grow_placements(
     grown: list[_Growth] = []
     covered: set[tuple[int, int]] = set()
     for seed in seeds:
-        if len(grown) == count:
+        if len(grown) == _MAX_PLACEMENTS:
             break
         if seed in covered:
             continue

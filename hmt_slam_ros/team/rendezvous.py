@@ -19,7 +19,7 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.team import TeamRendezvous
 from hmt_slam_ros.team.components import ComponentPair
-from hmt_slam_ros.team.placement import UNSEEN_AREAS, WindowCandidate
+from hmt_slam_ros.team.placement import PlacementPrior, WindowCandidate
 from hmt_slam_ros.team.windows import Window
 
 _RELIABILITY = 0.95
@@ -124,7 +124,8 @@ def rendezvous_window(pair: ComponentPair, rendezvous: Rendezvous) -> Rendezvous
         return None
     belief = first.belief.compose(rendezvous.pose).compose(PoseGaussian(np.zeros(3), second.belief.covariance))
     peak = 1.0 / math.sqrt((2.0 * math.pi) ** 3 * float(np.linalg.det(belief.covariance)))
-    odds = 1.0 - _RELIABILITY + _RELIABILITY * peak * 2.0 * math.pi * _AREA_SIZE * (len(pair.known) + UNSEEN_AREAS)
+    places = PlacementPrior.of_pair(len(pair.known), len(pair.other)).places
+    odds = 1.0 - _RELIABILITY + _RELIABILITY * peak * 2.0 * math.pi * _AREA_SIZE * places
     window = Window(second.area, second.belief.mean, {second.keyframe: second.pose_of_keyframe})
     return RendezvousWindow(window, first.area, belief, math.log(odds))
 
