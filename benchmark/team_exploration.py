@@ -20,11 +20,12 @@ from benchmark.settings import Settings, chosen_seeds
 from hmt_slam_ros.configuration import load_configuration
 from hmt_slam_ros.exploration.explorer import Explorer
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.logs.records import LogRecord
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.routing import Process
 from hmt_slam_ros.messages.tasks import Task
-from hmt_slam_ros.messages.team import TeamPlacement, Verdict
+from hmt_slam_ros.messages.team import TeamPlacement, TeamRendezvous, Verdict
 from hmt_slam_ros.offline.team_run import TeamRun
 from hmt_slam_ros.simulation.driven_robot import DrivenLog, DrivenRobot
 from hmt_slam_ros.simulation.scenario import START
@@ -38,11 +39,18 @@ SHARE = 0.6
 _TIME = 2000.0
 """Longest exploration, s."""
 
+_RENDEZVOUS_TIME = 0.5
+"""After the start, s: between the first keyframes of the robots."""
+
+_RENDEZVOUS_COVARIANCE = np.diag([0.1, 0.1, math.radians(3.0)]) ** 2
+"""Of where one robot stands as seen from the other, m and rad, squared."""
+
 POLICY = (
     f"An institute of 13 states with {PEOPLE} people and lasers that see all around. Explorers drive the robots by the "
-    "package's own SLAM, in lock-step. Two begin at one place, back to back, and know nothing of it; with "
-    "team.uses_ground they share their ground once they are joined. The time is that until the last explorer reports "
-    "its end. *In both* counts rooms that both robots entered after they were joined."
+    "package's own SLAM, in lock-step. Two begin at one place, back to back, and know nothing of it, or have a "
+    "rendezvous there: who puts two robots side by side knows how they stand. With team.uses_ground they share their "
+    "ground once they are joined. The time is that until the last explorer reports its end. *In both* counts rooms "
+    "that both robots entered after they were joined."
 )
 
 
@@ -52,6 +60,7 @@ class TeamExploration:
 
     :ivar seed: of the building.
     :ivar robots: number of robots.
+    :ivar has_rendezvous: whether they know how they stood at the start.
     :ivar seconds: until the last one reported its end; inf without.
     :ivar joined: time until the first join, s; inf without.
     :ivar distance: of all robots, m.
@@ -63,6 +72,7 @@ class TeamExploration:
 
     seed: int
     robots: int
+    has_rendezvous: bool
     seconds: float
     joined: float
     distance: float
@@ -109,8 +119,11 @@ class _ExplorerLog(DrivenLog):
             yield record
 
 
-def explore_together(changes: tuple[str, ...], seed: int, robots: int) -> TeamExploration:
-    """Let some robots explore a building."""
+def explore_together(changes: tuple[str, ...], seed: int, robots: int, has_rendezvous: bool = False) -> TeamExploration:
+    """Let some robots explore a building.
+
+    :param has_rendezvous: whether the first two know how they stand at the start.
+    """
     configuration = load_configuration(PARAMETERS, ["team.uses_ground=true", *changes])
     exploration, joined = _ExploringTeam(seed, robots), math.inf
 
@@ -126,6 +139,9 @@ def explore_together(changes: tuple[str, ...], seed: int, robots: int) -> TeamEx
     run = TeamRun(configuration, logs, note, observers=observers)
     for own in run.runs.values():
         own.lock_step.feed(Task("explore"))
+    if has_rendezvous:
+        for team in run.teams.values():
+            team.handle(_rendezvous_at_start(exploration))
     run.run()
     rooms, found = exploration.robots["robot 1"].scenario.building.rooms, list(exploration.robots.values())
     paths = [robot.true_poses(np.arange(START, robot.stamp, NANOSECONDS // 5))[:, :2] for robot in found]
@@ -134,6 +150,7 @@ def explore_together(changes: tuple[str, ...], seed: int, robots: int) -> TeamEx
     return TeamExploration(
         seed,
         robots,
+        has_rendezvous,
         max(robot.stamp - START for robot in found) / NANOSECONDS if exploration.is_over else math.inf,
         joined,
         sum(robot.distance_traveled for robot in found),
@@ -144,10 +161,19 @@ def explore_together(changes: tuple[str, ...], seed: int, robots: int) -> TeamEx
     )
 
 
+def _rendezvous_at_start(exploration: _ExploringTeam) -> TeamRendezvous:
+    """How the first two robots stand, by whoever put them there."""
+    (name, first), (other, second), *_ = exploration.robots.items()
+    stamp = START + round(_RENDEZVOUS_TIME * NANOSECONDS)
+    return TeamRendezvous(
+        name, stamp, other, stamp, PoseGaussian(se2.between(first.pose, second.pose), _RENDEZVOUS_COVARIANCE)
+    )
+
+
 def measure_team_exploration(settings: Settings) -> Report:
     """Explore institutes by one robot, and by two."""
     seeds = chosen_seeds(settings, SEEDS)
-    cases = [(seed, robots) for seed in seeds for robots in (1, 2)]
+    cases = [(seed, *case) for seed in seeds for case in ((1, False), (2, False), (2, True))]
     with ProcessPoolExecutor(settings.runner.jobs, multiprocessing.get_context("spawn")) as pool:
         found = list(pool.map(partial(explore_together, tuple(settings.changes)), *zip(*cases, strict=True)))
     report = Report("team_exploration", "Exploration by a team", seeds=seeds)
@@ -159,20 +185,28 @@ def measure_team_exploration(settings: Settings) -> Report:
 
 def requirements(found: list[TeamExploration]) -> list[Requirement]:
     """Requirements on the time of two, and on what they explored."""
-    alone, together = ([each for each in found if each.robots == robots] for robots in (1, 2))
-    share = mean([two.seconds / one.seconds for one, two in zip(alone, together, strict=True)])
+    together = [each for each in found if each.robots == 2]
     entered = sum(each.entered for each in together) / sum(each.rooms for each in together)
     return [
-        Requirement("time of two explorers, as a share of one's", share, SHARE),
+        Requirement("time of two explorers, as a share of one's", _share_of_one(found, False), SHARE),
+        Requirement("the same with a rendezvous at the start", _share_of_one(found, True), SHARE),
         Requirement("rooms entered by two", entered, 1.0, least=0.98),
         Requirement("rooms that both entered after they were joined", float(sum(e.in_both for e in together)), 0.0),
         Requirement("contacts", float(sum(each.contacts for each in found)), 0.0),
     ]
 
 
+def _share_of_one(found: list[TeamExploration], has_rendezvous: bool) -> float:
+    """Time of two, as a share of that of one, on average."""
+    alone = {each.seed: each.seconds for each in found if each.robots == 1}
+    together = [each for each in found if each.robots == 2 and each.has_rendezvous == has_rendezvous]
+    return mean([each.seconds / alone[each.seed] for each in together])
+
+
 _COLUMNS: Columns[TeamExploration] = [
     ("building", lambda row: str(row.seed)),
     ("robots", lambda row: str(row.robots)),
+    ("rendezvous", lambda row: "yes" if row.has_rendezvous else "no"),
     ("time [s]", lambda row: f"{row.seconds:.0f}"),
     ("joined after [s]", lambda row: f"{row.joined:.0f}"),
     ("distance of all [m]", lambda row: f"{row.distance:.0f}"),
