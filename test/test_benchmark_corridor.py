@@ -11,6 +11,7 @@ def drives():
     return [drive(seed) for seed in range(72)]
 
 
+@pytest.mark.long
 def test_the_covariance_along_a_bare_corridor_covers_the_truth(drives):
     for stride, low, high, covered in ((1, 0.7, 1.3, 0.9), (20, 0.5, 1.7, 0.85)):
         found = errors_of(drives, stride)

@@ -87,6 +87,7 @@ def compare_runs(log, folder, stops, branching=lambda: Branching, configuration=
     return stopped
 
 
+@pytest.mark.long
 def test_a_run_that_forgot_keyframes_goes_on_without_them(tmp_path):
     known = [0]
 

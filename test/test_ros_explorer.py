@@ -147,7 +147,7 @@ def assert_room_is_the_arm(message):
 
 def assert_stands_beside_a_silent_laser(listener, nodes, reports, truths):
     silence = "scans come on scan, and none on scan_rear, so that the robot stands"
-    listener.until(lambda: any(silence in one.status[0].message for one in reports), alive=nodes)
+    listener.until(lambda: any(silence in one.status[0].message for one in reports) and truths, alive=nodes)
     assert np.ptp([pose_from_message(message.pose) for message in truths], axis=0).max() < 1e-9
 
 

@@ -90,6 +90,7 @@ def test_of_a_ring_with_equal_sides_four_placements_keep_their_probabilities():
     assert sum(probabilities) < 0.5
 
 
+@pytest.mark.long
 def test_a_third_map_joins_the_piece_that_it_fits():
     parts = {"a": map_lap(OFFICE, 0), "other": map_lap(OTHER, 0), "b": map_lap(OFFICE, 1)}
     team = merge_components(parts, CONFIGURATION)
