@@ -21,7 +21,7 @@ from hmt_slam_ros.exploration.look_planner import LookPlanner
 from hmt_slam_ros.exploration.path_follower import PathFollower, Route, motion_limits
 from hmt_slam_ros.exploration.pose_goals import anchor_elsewhere
 from hmt_slam_ros.exploration.roadmap import EntryPoint, Frontier
-from hmt_slam_ros.exploration.teammates import Cost, choose_frontier, group_frontiers
+from hmt_slam_ros.exploration.teammates import Cost, choose_frontier
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.ambiguity import Ambiguity
@@ -69,13 +69,9 @@ class Explorer:
     :ivar task: what it does; None without a task.
     """
 
-    def __init__(self, configuration: Configuration, known: Replica | None = None, robot: str = "") -> None:
-        """:param known: the initial map; None for an empty one.
-
-        :param robot: its name in its team.
-        """
+    def __init__(self, configuration: Configuration, known: Replica | None = None) -> None:
+        """:param known: the initial map; None for an empty one."""
         parameters = configuration.explorer
-        self._robot = robot
         self._limits = motion_limits(parameters)
         self._stuck_timeout = round(NANOSECONDS * parameters.stuck_timeout)
         self.exploration_map = ExplorationMap(configuration, known)
@@ -260,9 +256,8 @@ class Explorer:
         costs = self._frontier_costs(here.keyframe, left)
         if not costs:
             return self._retry_or_finish()
-        others = self.exploration_map.teammates.positions(roadmap.graph)
-        costs_of_others = {name: self._frontier_costs(k, costs) for name, k in others.items()}
-        number = choose_frontier(costs, costs_of_others, self._frontier_groups(costs), self._robot)
+        others = self.exploration_map.teammates.positions()
+        number = choose_frontier(costs, {name: self._frontier_costs(k, costs) for name, k in others.items()})
         if number is None:
             return []
         target = self._target = roadmap.frontiers[number]
@@ -272,26 +267,13 @@ class Explorer:
     def _frontier_costs(self, start: int, numbers: Iterable[int]) -> dict[int, Cost]:
         """{number: cost from a keyframe on} of those frontiers that can be reached."""
         roadmap = self.exploration_map.roadmap
-        distances = roadmap.distances(start)
+        distances = roadmap.distances(start) if start in roadmap.graph else {}
         frontiers = {number: roadmap.frontiers[number] for number in numbers}
         return {
             number: (not frontier.is_in_hallway, distances[frontier.keyframe] + frontier.length)
             for number, frontier in frontiers.items()
             if frontier.keyframe in distances
         }
-
-    def _frontier_groups(self, numbers: Iterable[int]) -> dict[int, int]:
-        """{number: group}: one robot of a team explores a group."""
-        rooms, hallways = dict[int, Float64](), dict[int, Float64]()
-        for number in numbers:
-            frontier = self.exploration_map.roadmap.frontiers[number]
-            (hallways if frontier.is_in_hallway else rooms)[number] = self._position(frontier)
-        return group_frontiers(rooms) | group_frontiers(hallways)
-
-    def _position(self, frontier: Frontier) -> Float64:
-        """Where a frontier is, in the frame of the robot's area, shape (2,)."""
-        pose = self.exploration_map.keyframe_locator.keyframe_pose(frontier.keyframe)
-        return se2.transform(pose, frontier.path[-1])
 
     def _retry_or_finish(self) -> list[Message]:
         """Retry frontiers that were given up, maybe because of people, while any of them is reached; else finish."""
@@ -303,7 +285,8 @@ class Explorer:
 
     def _was_tried(self, frontier: Frontier) -> bool:
         """Whether a frontier was reached or given up."""
-        locator, position = self.exploration_map.keyframe_locator, self._position(frontier)
+        locator = self.exploration_map.keyframe_locator
+        position = se2.transform(locator.keyframe_pose(frontier.keyframe), frontier.path[-1])
         return any(
             math.dist(position, se2.transform(locator.keyframe_pose(keyframe), point)) < _SAME_FRONTIER_DISTANCE
             for keyframe, point in self._reached_frontiers + self._abandoned_frontiers
