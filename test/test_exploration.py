@@ -127,7 +127,7 @@ def test_ground_of_another_robot_is_known_and_what_is_nearer_to_it_is_left_to_it
     best = known.replica.best_hypothesis
     explorer.handle(ClosureDecision(known.event, best, (), (), foreign_ground=ground))
     own.run.run_task(Task("explore"), 2.0)
-    assert known.teammates.positions(known.roadmap.graph) == {"bob": -6} and not known.teammates.new_keyframes
+    assert known.teammates.positions() == {"bob": -6} and not known.teammates.new_keyframes
     # Not the left room: the eastern half.
     x, y = target_in_building(explorer)
     assert x > 7.0 and y < 1.0
