@@ -37,7 +37,8 @@ def part(component, share, first=0.0):
 def finish(search):
     """Take all steps; their number."""
     count = 0
-    while search.step() is not None:
+    while (work := search.step()) is not None:
+        assert work > 0
         count += 1
     return count
 

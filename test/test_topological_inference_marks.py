@@ -337,7 +337,7 @@ def test_a_mark_alone_is_as_sure_as_it_is_right_and_its_visits_share_that(earlie
     assert probabilities[40] < WRONG * flat * 1.01
 
 
-def test_a_mark_tells_nothing_beside_an_initial_pose_of_a_searched_keyframe():
+def test_a_mark_is_no_evidence_beside_an_initial_pose_of_a_searched_keyframe():
     branching = Branching(Configuration(), Replica())
     branching.marks = lost_memory(visit(3, line_pose(1, 1.0)), pose=line_pose(1, 0.5))
     parent = Parent(4, 2, line(0.1), HypothesisState(), 0.0)
