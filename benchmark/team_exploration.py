@@ -133,7 +133,8 @@ def explore_together(changes: tuple[str, ...], seed: int, robots: int, has_rende
             joined = min(joined, seconds)
 
     observers: dict[str, dict[str, Process]] = {
-        name: {"explorer": Explorer(configuration), "robot": process} for name, process in exploration.processes.items()
+        name: {"explorer": Explorer(configuration, robot=name), "robot": process}
+        for name, process in exploration.processes.items()
     }
     logs = {name: _ExplorerLog(exploration, name) for name in exploration.robots}
     run = TeamRun(configuration, logs, note, observers=observers)

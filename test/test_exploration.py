@@ -121,16 +121,32 @@ def test_ground_of_another_robot_is_known_and_what_is_nearer_to_it_is_left_to_it
     known = explorer.exploration_map
     # To the end of the arm, where another robot has been; that is in the door of the left room now.
     assert target_in_building(explorer) == pytest.approx((6.0, 8.0), abs=1.0)
-    places = [(6.0, 2.0, 1.6), (6.0, 5.0, 1.6), (6.0, 8.0, 1.6), (6.0, 5.0, -1.6), (3.0, -1.0, -1.6)]
-    keyframes = [ForeignKeyframe(-2 - n, 0, np.array(place) - ORIGIN, scan_at(place)) for n, place in enumerate(places)]
-    ground = ForeignGround("bob", tuple(keyframes))
-    best = known.replica.best_hypothesis
-    explorer.handle(ClosureDecision(known.event, best, (), (), foreign_ground=ground))
+    share_ground(own, [(6.0, 2.0, 1.6), (6.0, 5.0, 1.6), (6.0, 8.0, 1.6), (6.0, 5.0, -1.6), (3.0, -1.0, -1.6)])
     own.run.run_task(Task("explore"), 2.0)
-    assert known.teammates.positions() == {"bob": -6} and not known.teammates.new_keyframes
+    assert known.teammates.positions(known.roadmap.graph) == {"bob": -6} and not known.teammates.new_keyframes
     # Not the left room: the eastern half.
     x, y = target_in_building(explorer)
     assert x > 7.0 and y < 1.0
+
+
+def test_ground_that_changes_no_choice_keeps_the_route_and_the_time_since_the_last_progress() -> None:
+    own = _Explored(explore=False)
+    own.run.run_task(Task("explore"), 16.0)
+    explorer, scans = own.run.driver, own.run.drive(Task("explore"), 2.0)
+    next(scans)
+    route, follower = explorer._route, explorer._path_follower
+    share_ground(own, [(3.0, -1.0, -1.6)])
+    next(scans)
+    assert not explorer.exploration_map.teammates.new_keyframes
+    assert explorer._route is route and explorer._path_follower is follower
+
+
+def share_ground(own: _Explored, places: list[tuple[float, float, float]]) -> None:
+    """Send an explorer ground of another robot, with a keyframe at each place of the floor."""
+    known = own.run.driver.exploration_map
+    keyframes = [ForeignKeyframe(-2 - n, 0, np.array(place) - ORIGIN, scan_at(place)) for n, place in enumerate(places)]
+    ground, best = ForeignGround("bob", tuple(keyframes)), known.replica.best_hypothesis
+    own.run.driver.handle(ClosureDecision(known.event, best, (), (), foreign_ground=ground))
 
 
 def target_in_building(explorer: Explorer) -> Float64:

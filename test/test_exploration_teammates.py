@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import worlds
 
-from hmt_slam_ros.exploration.teammates import Teammates, choose_frontier
+from hmt_slam_ros.exploration.teammates import Teammates, choose_frontier, group_frontiers
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.map_changes import ForeignGround, ForeignKeyframe
 
@@ -23,20 +23,47 @@ def ground(robot, *keyframes):
         # The other one is nearer to it.
         ({0: (HALLWAY, 5.0), 1: (HALLWAY, 6.0)}, {"bob": {0: (HALLWAY, 2.0), 1: (HALLWAY, 9.0)}}, 1),
         ({0: (HALLWAY, 5.0), 1: (HALLWAY, 6.0)}, {"bob": {0: (HALLWAY, 3.5), 1: (HALLWAY, 2.0)}}, 0),
-        # One frontier is left, and it is the other's, where that is certainly nearer.
+        # One frontier is left, and it is the other's.
         ({0: (ROOM, 5.0)}, {"bob": {0: (ROOM, 2.0)}}, None),
-        ({0: (ROOM, 5.0)}, {"bob": {0: (ROOM, 4.0)}}, 0),
         ({0: (ROOM, 5.0)}, {"bob": {}}, 0),
+        # The first by name goes, unless the other is certainly nearer.
+        ({0: (ROOM, 5.0)}, {"dan": {0: (ROOM, 2.0)}}, 0),
+        ({0: (ROOM, 8.0)}, {"dan": {0: (ROOM, 2.0)}}, None),
         # Three robots, each another one.
         (
             {0: (ROOM, 5.0), 1: (ROOM, 6.0), 2: (ROOM, 9.0)},
-            {"bob": {0: (ROOM, 1.0), 1: (ROOM, 3.5)}, "cid": {1: (ROOM, 1.0)}},
+            {"abe": {0: (ROOM, 1.0), 1: (ROOM, 3.5)}, "bob": {1: (ROOM, 1.0)}},
             2,
         ),
     ],
 )
 def test_each_robot_has_a_frontier_of_its_own(own, others, chosen):
-    assert choose_frontier(own, others) == chosen
+    assert choose_frontier(own, others, {0: 0, 1: 1, 2: 2}, "cid") == chosen
+
+
+def test_no_two_go_to_one_room():
+    own = {0: (ROOM, 4.0), 1: (ROOM, 5.0), 2: (ROOM, 20.0)}
+    others = {"bob": {0: (ROOM, 3.0), 1: (ROOM, 9.0), 2: (ROOM, 30.0)}}
+    assert choose_frontier(own, others, {0: 0, 1: 1, 2: 2}, "cid") == 1
+    assert choose_frontier(own, others, {0: 0, 1: 0, 2: 2}, "cid") == 2
+
+
+def test_frontiers_of_a_room_are_a_group():
+    positions = {3: (0.0, 0.0), 4: (4.0, 0.0), 6: (9.0, 0.0), 7: (9.0, 3.0)}
+    assert group_frontiers({n: np.array(each) for n, each in positions.items()}) == {3: 3, 4: 3, 6: 6, 7: 6}
+
+
+def test_of_two_robots_that_are_as_near_one_goes_and_never_both_stand():
+    """Though each is shown to the other where it was up to 2.5 m ago."""
+    assert choose_frontier({0: (ROOM, 5.0)}, {"bob": {0: (ROOM, 5.0)}}, {0: 0}, "ann") == 0
+    assert choose_frontier({0: (ROOM, 5.0)}, {"ann": {0: (ROOM, 5.0)}}, {0: 0}, "bob") is None
+    random = np.random.default_rng(5)
+    for _ in range(1000):
+        ann, bob = random.uniform(0.0, 10.0, 2)
+        shown_ann, shown_bob = random.uniform(-2.5, 2.5, 2) + np.array([ann, bob])
+        of_ann = choose_frontier({0: (ROOM, ann)}, {"bob": {0: (ROOM, shown_bob)}}, {0: 0}, "ann")
+        of_bob = choose_frontier({0: (ROOM, bob)}, {"ann": {0: (ROOM, shown_ann)}}, {0: 0}, "bob")
+        assert 0 in (of_ann, of_bob)
 
 
 def test_where_a_robot_is_shows_in_its_newest_ground():
@@ -44,7 +71,9 @@ def test_where_a_robot_is_shows_in_its_newest_ground():
     teammates.add(ground("bob", -2, -3))
     teammates.add(ground("cid", -4))
     teammates.add(ground("bob", -5))
-    assert teammates.positions() == {"bob": -5, "cid": -4}
+    assert teammates.positions({-2, -3, -4, -5}) == {"bob": -5, "cid": -4}
+    # What the roadmap does not have yet shows nothing.
+    assert teammates.positions({-2, -3}) == {"bob": -3}
     assert teammates.new_keyframes == [-2, -3, -4, -5]
 
 
@@ -56,4 +85,4 @@ def test_nothing_is_left_to_a_robot_that_maps_no_more():
     teammates.add(ground("cid", -3))
     teammates.add(ground("bob"))
     teammates.update(170 * NANOSECONDS)
-    assert teammates.positions() == {"cid": -3}
+    assert teammates.positions({-2, -3}) == {"cid": -3}

@@ -9,13 +9,15 @@ import pytest
 
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.messages.team import TeamPlacement, TeamRequest, TeamStatus, TeamUpdate, Verdict
+from hmt_slam_ros.messages.team import JoinedGround, TeamPlacement, TeamRequest, TeamStatus, TeamUpdate, Verdict
 from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.offline.team_run import TeamRun
 from hmt_slam_ros.open_log import open_log
 from hmt_slam_ros.registration.consistency import NO_CLUTTER
 from hmt_slam_ros.team import shared_map
 from hmt_slam_ros.team import team as team_module
+from hmt_slam_ros.team.join_state import JoinState
+from hmt_slam_ros.team.shared_map import ForeignMapState
 from hmt_slam_ros.team.team import MAX_ROBOTS, Team, TeamState
 
 CONFIGURATION = Configuration(seed=50)
@@ -253,6 +255,27 @@ def test_the_work_of_an_event_is_bounded(monkeypatch, limit):
     while bob.is_searching:
         bob.search(2 * limit)
     assert bob.meetings["abe"].verdict is Verdict.JOINED
+
+
+def test_ground_of_a_joined_robot_is_known_before_the_maps_are_compared_again():
+    run, _, _ = office_run()
+    ann, bob = run.teams["ann"], run.teams["bob"].state
+    unknown = {"ann": ForeignMapState(ann.session)}
+    ground = {}
+    for is_joined in (False, True):
+        state = replace(bob, others=unknown, joins={"ann": JoinState(is_joined)})
+        team = Team(with_changes(CONFIGURATION, {"team.uses_ground": True}), state)
+        waiting, answers = [ann.status], []
+        while waiting:
+            for answer in team.handle(waiting.pop()):
+                answers.append(answer)
+                if isinstance(answer, TeamRequest):
+                    waiting += ann.handle(replace(answer, robot="eve"))
+        assert team.meetings == {}
+        ground[is_joined] = [each for each in answers if isinstance(each, JoinedGround)]
+    assert ground[False] == []
+    shared = {area.area for update in ground[True] for area in update.areas}
+    assert shared == {area.area for area in ann.state.shared.areas}
 
 
 def errors(recording, truth):

@@ -21,7 +21,7 @@ from hmt_slam_ros.exploration.look_planner import LookPlanner
 from hmt_slam_ros.exploration.path_follower import PathFollower, Route, motion_limits
 from hmt_slam_ros.exploration.pose_goals import anchor_elsewhere
 from hmt_slam_ros.exploration.roadmap import EntryPoint, Frontier
-from hmt_slam_ros.exploration.teammates import Cost, choose_frontier
+from hmt_slam_ros.exploration.teammates import Cost, choose_frontier, group_frontiers
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.ambiguity import Ambiguity
@@ -69,9 +69,13 @@ class Explorer:
     :ivar task: what it does; None without a task.
     """
 
-    def __init__(self, configuration: Configuration, known: Replica | None = None) -> None:
-        """:param known: the initial map; None for an empty one."""
+    def __init__(self, configuration: Configuration, known: Replica | None = None, robot: str = "") -> None:
+        """:param known: the initial map; None for an empty one.
+
+        :param robot: its name in its team.
+        """
         parameters = configuration.explorer
+        self._robot = robot
         self._limits = motion_limits(parameters)
         self._stuck_timeout = round(NANOSECONDS * parameters.stuck_timeout)
         self.exploration_map = ExplorationMap(configuration, known)
@@ -131,7 +135,7 @@ class Explorer:
         if ready and self.task is not None:
             if self.exploration_map.has_changed and not self._keeps_route():
                 self._route = None
-            if self._route is None:
+            if self._route is None or self._has_news_of_others:
                 outputs += self._choose_goal(self.task, scan.stamp)
         self._velocity = self._follow_route(view, outputs) if ready and self._route is not None else _STAND
         return [*outputs, VelocityCommand(scan.stamp, *self._velocity)]
@@ -152,14 +156,18 @@ class Explorer:
             return self._is_looking and self._look_planner.keeps_target(self.exploration_map.keyframe_locator, robot)
         if self._is_backtracking or self._is_ambiguous:
             return self._is_backtracking and self._is_ambiguous
-        if self._is_exploring and self.exploration_map.teammates.new_keyframes:
-            return False
         in_hallway = self._is_exploring and self._target is not None and self._target.is_in_hallway
         return not (in_hallway and self._path_follower.remaining < _RESELECT_DISTANCE)
 
     @property
     def _is_exploring(self) -> bool:
         return self.task is not None and self.task.kind == "explore"
+
+    @property
+    def _has_news_of_others(self) -> bool:
+        """Whether new ground of another robot may change which frontier is this robot's."""
+        is_open = self._is_exploring and not (self._is_looking or self._is_backtracking)
+        return is_open and bool(self.exploration_map.teammates.new_keyframes)
 
     @property
     def _is_ambiguous(self) -> bool:
@@ -227,7 +235,7 @@ class Explorer:
 
     def _choose_goal(self, task: Task, stamp: int) -> list[Message]:
         """Plan a route for a task."""
-        here = self.exploration_map.update_roadmap()
+        here, before = self.exploration_map.update_roadmap(), self._route
         if here is None:
             return []
         self._is_looking = task.kind == "disambiguate" or self._looks_first
@@ -240,7 +248,7 @@ class Explorer:
         }
         plan = self._plan_look if self._is_looking else planners[task.kind]
         outputs = self._plan_backtracking(here) if self._is_backtracking else plan(here)
-        if self._route is not None:
+        if self._route is not None and self._route is not before:
             area, goal = self.exploration_map.goal_pose(self._route, self._goal)
             outputs.append(GoalPose(stamp, area, goal))
         return outputs
@@ -255,25 +263,50 @@ class Explorer:
         left = [number for number, frontier in enumerate(roadmap.frontiers) if not self._was_tried(frontier)]
         costs = self._frontier_costs(here.keyframe, left)
         if not costs:
+            self._route = None
             return self._retry_or_finish()
-        others = self.exploration_map.teammates.positions()
-        number = choose_frontier(costs, {name: self._frontier_costs(k, costs) for name, k in others.items()})
+        others = self.exploration_map.teammates.positions(roadmap.graph)
+        costs_of_others = {name: self._frontier_costs(k, costs) for name, k in others.items()}
+        number = choose_frontier(costs, costs_of_others, self._frontier_groups(costs), self._robot)
         if number is None:
+            self._route = None
             return []
-        target = self._target = roadmap.frontiers[number]
+        target = roadmap.frontiers[number]
+        if self._route is not None and self._is_target(target):
+            return []
+        self._target = target
         self._set_route(here, roadmap.shortest_path(here.keyframe, target.keyframe), target.path, _FRONTIER_TOLERANCE)
         return []
 
     def _frontier_costs(self, start: int, numbers: Iterable[int]) -> dict[int, Cost]:
         """{number: cost from a keyframe on} of those frontiers that can be reached."""
         roadmap = self.exploration_map.roadmap
-        distances = roadmap.distances(start) if start in roadmap.graph else {}
+        distances = roadmap.distances(start)
         frontiers = {number: roadmap.frontiers[number] for number in numbers}
         return {
             number: (not frontier.is_in_hallway, distances[frontier.keyframe] + frontier.length)
             for number, frontier in frontiers.items()
             if frontier.keyframe in distances
         }
+
+    def _is_target(self, frontier: Frontier) -> bool:
+        """Whether the robot is on its way to a frontier."""
+        assert self._target is not None
+        distance = math.dist(self._position(frontier), self._position(self._target))
+        return distance < _SAME_FRONTIER_DISTANCE
+
+    def _frontier_groups(self, numbers: Iterable[int]) -> dict[int, int]:
+        """{number: group}: one robot of a team explores a group."""
+        rooms, hallways = dict[int, Float64](), dict[int, Float64]()
+        for number in numbers:
+            frontier = self.exploration_map.roadmap.frontiers[number]
+            (hallways if frontier.is_in_hallway else rooms)[number] = self._position(frontier)
+        return group_frontiers(rooms) | group_frontiers(hallways)
+
+    def _position(self, frontier: Frontier) -> Float64:
+        """Where a frontier is, in the frame of the robot's area, shape (2,)."""
+        pose = self.exploration_map.keyframe_locator.keyframe_pose(frontier.keyframe)
+        return se2.transform(pose, frontier.path[-1])
 
     def _retry_or_finish(self) -> list[Message]:
         """Retry frontiers that were given up, maybe because of people, while any of them is reached; else finish."""
@@ -285,8 +318,7 @@ class Explorer:
 
     def _was_tried(self, frontier: Frontier) -> bool:
         """Whether a frontier was reached or given up."""
-        locator = self.exploration_map.keyframe_locator
-        position = se2.transform(locator.keyframe_pose(frontier.keyframe), frontier.path[-1])
+        locator, position = self.exploration_map.keyframe_locator, self._position(frontier)
         return any(
             math.dist(position, se2.transform(locator.keyframe_pose(keyframe), point)) < _SAME_FRONTIER_DISTANCE
             for keyframe, point in self._reached_frontiers + self._abandoned_frontiers

@@ -1,13 +1,16 @@
 """The other robots of a team in an exploration: what they have mapped, and which frontiers are left to them.
 
 Frontiers are assigned greedily, the cheapest pair of a robot and a frontier first (Burgard, Moors, Stachniss and
-Schneider 2005, without utilities). Robots that are joined have the same map, up to what is under way.
+Schneider 2005). Who goes to a frontier sees those around it, which lose their utility for the rest. Robots
+that are joined have the same map, up to what is under way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Container, Mapping
 
+from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.map_changes import ForeignGround
 
@@ -15,10 +18,10 @@ Cost = tuple[bool, float]
 """Of a frontier for a robot: whether it is in no hallway, then the path to it, m."""
 
 _LAG = 2.5
-"""Added to the path of another robot, m: it is shown where it was up to five keyframes ago.
+"""By how much the path of another robot may be wrong, m: it is shown where it was up to five keyframes ago."""
 
-Without it two robots may stand, each for the other.
-"""
+_SEEN_FROM_THERE = 5.0
+"""Distance of two frontiers in rooms, or of two in hallways, up to which one robot explores both, m."""
 
 _TIMEOUT = 60 * NANOSECONDS
 """Time without new ground after which nothing is left to a robot: it may have stopped, ns."""
@@ -32,38 +35,61 @@ class Teammates:
 
     def __init__(self) -> None:
         self.new_keyframes: list[int] = []
-        self._newest: dict[str, int] = {}
+        self._keyframes: dict[str, list[int]] = {}
         self._arrived: dict[str, int] = {}
         self._stamp = 0
 
     def add(self, ground: ForeignGround) -> None:
         """Note new ground of a robot."""
         if ground.keyframes:
-            self.new_keyframes += [each.keyframe for each in ground.keyframes]
-            self._newest[ground.robot] = ground.keyframes[-1].keyframe
+            keyframes = [each.keyframe for each in ground.keyframes]
+            self.new_keyframes += keyframes
+            self._keyframes.setdefault(ground.robot, []).extend(keyframes)
             self._arrived[ground.robot] = self._stamp
 
     def update(self, stamp: int) -> None:
         """Note the time, ns."""
         self._stamp = stamp
 
-    def positions(self) -> dict[str, int]:
-        """{robot: its newest keyframe} of those that explore."""
-        return {name: k for name, k in self._newest.items() if self._stamp - self._arrived[name] <= _TIMEOUT}
+    def positions(self, roadmap: Container[int]) -> dict[str, int]:
+        """{robot: its newest keyframe in a roadmap} of those that explore, and have one."""
+        exploring = [name for name in self._keyframes if self._stamp - self._arrived[name] <= _TIMEOUT]
+        newest = {name: next((k for k in self._keyframes[name][::-1] if k in roadmap), None) for name in exploring}
+        return {name: keyframe for name, keyframe in newest.items() if keyframe is not None}
 
 
-def choose_frontier(own: Mapping[int, Cost], others: Mapping[str, Mapping[int, Cost]]) -> int | None:
+def group_frontiers(positions: Mapping[int, Float64]) -> dict[int, int]:
+    """{frontier: one of its room, or of its end of a hallway}: who goes to one sees the others.
+
+    :param positions: {frontier: where it is, shape (2,), m} of those in rooms, or of those in hallways.
+    """
+    groups: dict[int, int] = {}
+    for frontier, position in positions.items():
+        near = (n for n in set(groups.values()) if math.dist(position, positions[n]) <= _SEEN_FROM_THERE)
+        groups[frontier] = min(near, default=frontier)
+    return groups
+
+
+def choose_frontier(
+    own: Mapping[int, Cost], others: Mapping[str, Mapping[int, Cost]], groups: Mapping[int, int], robot: str
+) -> int | None:
     """The frontier that is this robot's, None where all are left to others.
+
+    Of two robots that are as near to one the first by name goes. It takes the other to be farther away by twice the
+    error of its path: so never both leave it to each other.
 
     :param own: {frontier: its cost for this robot}.
     :param others: {other robot: the same, from its newest keyframe on}.
+    :param groups: {frontier: its group}, which one robot explores.
+    :param robot: name of this robot.
     """
-    costs: dict[str, Mapping[int, Cost]] = {"": own}
+    costs: dict[str, Mapping[int, Cost]] = {robot: own}
     for name, each in others.items():
-        costs[name] = {frontier: (is_last, path + _LAG) for frontier, (is_last, path) in each.items()}
+        lag = 2.0 * _LAG if robot < name else 0.0
+        costs[name] = {frontier: (is_last, path + lag) for frontier, (is_last, path) in each.items()}
     pairs = sorted((cost, name, frontier) for name, each in costs.items() for frontier, cost in each.items())
     assigned: dict[str, int] = {}
     for _, name, frontier in pairs:
-        if name not in assigned and frontier not in assigned.values():
+        if name not in assigned and groups[frontier] not in {groups[each] for each in assigned.values()}:
             assigned[name] = frontier
-    return assigned.get("")
+    return assigned.get(robot)

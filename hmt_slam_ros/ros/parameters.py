@@ -140,6 +140,11 @@ def declare_system(node: Node) -> SystemName:
     return SystemName(str(node.declare_parameter("system", "", descriptor).value))
 
 
+def name_in_team(node: Node) -> str:
+    """The name that a robot has in its team by its namespace, empty without one."""
+    return node.get_namespace().strip("/").replace("/", ".")
+
+
 def declare_frame(node: Node, which: str, default: str, note: str = "") -> str:
     """Declare the parameter ``<which>_frame``, and return the name of the frame; ``note`` ends its description."""
     descriptor = ParameterDescriptor(description=f"Name of the {which} frame{note}.", read_only=True)

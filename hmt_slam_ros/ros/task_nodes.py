@@ -40,7 +40,7 @@ from hmt_slam_ros.ros.laser_mountings import LaserMountings
 from hmt_slam_ros.ros.map_publisher import MapPublisher
 from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
 from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, OdometryFrames, declare_odometry_frame
-from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_poses
+from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_poses, name_in_team
 from hmt_slam_ros.ros.room_markers import RoomMarkers
 from hmt_slam_ros.ros.task_interface import TaskHost, TaskInterface, TaskProcess
 from hmt_slam_ros.ros.task_scans import TaskScans
@@ -303,7 +303,8 @@ class ExplorerNode(TaskNode):
 
         document = initial_state.map
         self.area_poses = GlobalPoses((_FIRST_AREA_POSE,) if document is None else document.area_poses)
-        explorer = Explorer(self.configuration, None if document is None else Replica.from_state(document.replica))
+        known = None if document is None else Replica.from_state(document.replica)
+        explorer = Explorer(self.configuration, known, name_in_team(self))
         if self.configuration.explorer.explores:
             explorer.handle(Task("explore"))
         return explorer

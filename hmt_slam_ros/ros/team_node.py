@@ -27,7 +27,7 @@ from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import gaussian_from_message, stamp_from_time, transform_message
 from hmt_slam_ros.ros.initial_state import InitialState
 from hmt_slam_ros.ros.message_io import subscribe_document
-from hmt_slam_ros.ros.parameters import declare_frame
+from hmt_slam_ros.ros.parameters import declare_frame, name_in_team
 from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.topics import DOCUMENTS, RENDEZVOUS, transform_publisher
 
@@ -72,7 +72,7 @@ class TeamNode(ProcessNode):
         self._map_frame, self._team_frame = declare_frame(self, "map", "map"), declare_frame(self, "team", "team")
         self._bandwidth = float(self.declare_parameter("team_bandwidth", 100_000.0, _BANDWIDTH).value)
         name = str(self.declare_parameter("robot_name", "", _ROBOT_NAME).value)
-        self._robot = name or self.get_namespace().strip("/").replace("/", ".")
+        self._robot = name or name_in_team(self)
         if not self._robot:
             raise HmtSlamError("the robot has no name in its team: start its nodes in a namespace, or set robot_name")
 

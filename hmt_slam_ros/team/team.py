@@ -262,7 +262,8 @@ class Team:
             return []
         known.newest = max(known.newest, update.until)
         self._pairs[update.robot].is_outdated = True
-        return self._request(update.robot, known) if known.map.version < known.newest else []
+        requests = self._request(update.robot, known) if known.map.version < known.newest else []
+        return [*requests, *self._new_ground(update.robot)]
 
     def _note_placement(self, placement: TeamPlacement) -> None:
         """Remember what a robot of the team found."""
@@ -354,7 +355,8 @@ class Team:
         has_lasted = before.is_joined or was_sure(pair.search, meeting, self._configuration)
         is_first = self._robot == first
         pair.join = next_join(before, meeting, self._configuration, is_first=is_first, has_lasted=has_lasted)
-        ground = self._joined_ground(name, pair, before)
+        is_withdrawn = before.is_joined and not pair.join.is_joined
+        ground = self._withdraw_ground(name) if is_withdrawn else self._new_ground(name)
         now = _placement(self._robot, first, second, meeting)
         if meeting.verdict in (Verdict.JOINED, Verdict.OPEN):
             now = replace(now, verdict=Verdict.JOINED if pair.join.is_joined else Verdict.OPEN)
@@ -364,18 +366,21 @@ class Team:
         self._note_placement(now)
         return [now, *ground]
 
-    def _joined_ground(self, name: str, pair: _PairState, before: JoinState) -> list[Message]:
-        """What is new of the ground of a robot that is joined with this one; none of it where the join is withdrawn."""
-        other, join = self._others[name].map, pair.join
-        if not self._configuration.team.uses_ground:
+    def _new_ground(self, name: str) -> list[Message]:
+        """What the map lacks of the ground of a robot that is joined with this one."""
+        other, pair = self._others[name].map, self._pairs[name]
+        if not (self._configuration.team.uses_ground and pair.join.is_joined):
             return []
-        if not join.is_joined:
-            return [JoinedGround(name, other.session, (), (), ())] if before.is_joined else []
-        scans, areas = other.items_after(join.sent_version)
+        scans, areas = other.items_after(pair.join.sent_version)
         if not areas:
             return []
-        pair.join = replace(join, sent_version=other.version)
-        return [JoinedGround(name, other.session, scans, areas, join.joining_arcs)]
+        pair.join = replace(pair.join, sent_version=other.version)
+        return [JoinedGround(name, other.session, scans, areas, pair.join.joining_arcs)]
+
+    def _withdraw_ground(self, name: str) -> list[Message]:
+        """That a robot is no longer joined with this one."""
+        ground = JoinedGround(name, self._others[name].map.session, (), (), ())
+        return [ground] if self._configuration.team.uses_ground else []
 
 
 def _is_damaged(known: ForeignMap, status: TeamStatus) -> bool:
