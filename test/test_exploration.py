@@ -141,6 +141,23 @@ def test_ground_that_changes_no_choice_keeps_the_route_and_the_time_since_the_la
     assert explorer._route is route and explorer._path_follower is follower
 
 
+def test_an_exploration_ends_where_only_a_room_is_left_to_another_robot() -> None:
+    own = _Explored(explore=False)
+    explorer = own.run.driver
+    for _ in own.run.drive(Task("explore"), 200.0):
+        if explorer.named_rooms():
+            break
+    robot = own.robot.pose[:2]
+    x, _ = max(ROOMS, key=lambda room: float(np.hypot(*(room - robot))))
+    share_ground(own, [(x, -1.0, -1.6)])
+    outcome = completed_task(own.run.run_task(Task("explore"), 10.0))
+    assert (
+        outcome.succeeded
+        and outcome.reason == "all is known that can be reached, or left to bob; 0 places were given up"
+    )
+    assert len(explorer.named_rooms()) == 1
+
+
 def share_ground(own: _Explored, places: list[tuple[float, float, float]]) -> None:
     """Send an explorer ground of another robot, with a keyframe at each place of the floor."""
     known = own.run.driver.exploration_map

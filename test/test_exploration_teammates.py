@@ -49,8 +49,11 @@ def test_no_two_go_to_one_room():
 
 
 def test_frontiers_of_a_room_are_a_group():
-    positions = {3: (0.0, 0.0), 4: (4.0, 0.0), 6: (9.0, 0.0), 7: (9.0, 3.0)}
-    assert group_frontiers({n: np.array(each) for n, each in positions.items()}) == {3: 3, 4: 3, 6: 6, 7: 6}
+    in_rooms = {3: (0.0, 0.0), 4: (4.0, 0.0), 6: (9.0, 0.0), 7: (9.0, 3.0)}
+    in_hallways = {8: (2.0, 0.0), 9: (9.5, 0.0)}
+    frontiers = {n: (n in in_hallways, np.array(place)) for n, place in (in_rooms | in_hallways).items()}
+    # The last one is the frontier 6, which one keyframe takes to be in a room, and another one in a hallway.
+    assert group_frontiers(frontiers) == {3: 3, 4: 3, 6: 6, 7: 6, 8: 8, 9: 6}
 
 
 def test_of_two_robots_that_are_as_near_one_goes_and_never_both_stand():

@@ -20,7 +20,7 @@ from hmt_slam_ros.exploration.local_motion import turn_in_place
 from hmt_slam_ros.exploration.look_planner import LookPlanner
 from hmt_slam_ros.exploration.path_follower import PathFollower, Route, motion_limits
 from hmt_slam_ros.exploration.pose_goals import anchor_elsewhere
-from hmt_slam_ros.exploration.roadmap import EntryPoint, Frontier
+from hmt_slam_ros.exploration.roadmap import SAME_FRONTIER_DISTANCE, EntryPoint, Frontier
 from hmt_slam_ros.exploration.teammates import Cost, choose_frontier, group_frontiers
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
@@ -52,9 +52,6 @@ _TURN_GAIN = 0.5
 
 _RESELECT_DISTANCE = 3.0
 """Remaining distance to a frontier in a hallway at which a new one is chosen, as it moves on, m."""
-
-_SAME_FRONTIER_DISTANCE = 0.7
-"""Frontiers nearer to each other than this are one, m."""
 
 _TRIES = 3
 """Routes to a place before a task is given up."""
@@ -258,7 +255,10 @@ class Explorer:
         self._path_follower = PathFollower(self._limits, tolerance)
 
     def _plan_to_frontier(self, here: EntryPoint) -> list[Message]:
-        """Plan to the nearest frontier in a hallway, else to the nearest one; stand where all are left to others."""
+        """Plan to the nearest frontier in a hallway, else to the nearest one.
+
+        Where all are left to others the robot stands, as hallways may branch; where only rooms are left, the task ends.
+        """
         roadmap = self.exploration_map.roadmap
         left = [number for number, frontier in enumerate(roadmap.frontiers) if not self._was_tried(frontier)]
         costs = self._frontier_costs(here.keyframe, left)
@@ -267,10 +267,12 @@ class Explorer:
             return self._retry_or_finish()
         others = self.exploration_map.teammates.positions(roadmap.graph)
         costs_of_others = {name: self._frontier_costs(k, costs) for name, k in others.items()}
-        number = choose_frontier(costs, costs_of_others, self._frontier_groups(costs), self._robot)
+        groups = self._frontier_groups(costs)
+        number = choose_frontier(costs, costs_of_others, groups, self._robot)
         if number is None:
             self._route = None
-            return []
+            rooms = {groups[number] for number, (is_in_room, _) in costs.items() if is_in_room}
+            return self._retry_or_finish(others) if rooms.issuperset(groups.values()) else []
         target = roadmap.frontiers[number]
         if self._route is not None and self._is_target(target):
             return []
@@ -293,34 +295,36 @@ class Explorer:
         """Whether the robot is on its way to a frontier."""
         assert self._target is not None
         distance = math.dist(self._position(frontier), self._position(self._target))
-        return distance < _SAME_FRONTIER_DISTANCE
+        return distance < SAME_FRONTIER_DISTANCE
 
     def _frontier_groups(self, numbers: Iterable[int]) -> dict[int, int]:
         """{number: group}: one robot of a team explores a group."""
-        rooms, hallways = dict[int, Float64](), dict[int, Float64]()
-        for number in numbers:
-            frontier = self.exploration_map.roadmap.frontiers[number]
-            (hallways if frontier.is_in_hallway else rooms)[number] = self._position(frontier)
-        return group_frontiers(rooms) | group_frontiers(hallways)
+        frontiers = {number: self.exploration_map.roadmap.frontiers[number] for number in numbers}
+        return group_frontiers({n: (each.is_in_hallway, self._position(each)) for n, each in frontiers.items()})
 
     def _position(self, frontier: Frontier) -> Float64:
         """Where a frontier is, in the frame of the robot's area, shape (2,)."""
         pose = self.exploration_map.keyframe_locator.keyframe_pose(frontier.keyframe)
         return se2.transform(pose, frontier.path[-1])
 
-    def _retry_or_finish(self) -> list[Message]:
-        """Retry frontiers that were given up, maybe because of people, while any of them is reached; else finish."""
+    def _retry_or_finish(self, others: Iterable[str] = ()) -> list[Message]:
+        """Retry frontiers that were given up, maybe because of people, while any of them is reached; else finish.
+
+        :param others: robots to which rooms are left.
+        """
         if self._abandoned_frontiers and self._may_retry:
             self._may_retry, self._abandoned_frontiers = False, []
             return []
         left = len(self._abandoned_frontiers)
-        return self._finish_task(f"all is known that can be reached; {left} places were given up", reached=True)
+        left_to = f", or left to {' and '.join(others)}" if others else ""
+        text = f"all is known that can be reached{left_to}; {left} places were given up"
+        return self._finish_task(text, reached=True)
 
     def _was_tried(self, frontier: Frontier) -> bool:
         """Whether a frontier was reached or given up."""
         locator, position = self.exploration_map.keyframe_locator, self._position(frontier)
         return any(
-            math.dist(position, se2.transform(locator.keyframe_pose(keyframe), point)) < _SAME_FRONTIER_DISTANCE
+            math.dist(position, se2.transform(locator.keyframe_pose(keyframe), point)) < SAME_FRONTIER_DISTANCE
             for keyframe, point in self._reached_frontiers + self._abandoned_frontiers
             if keyframe in locator
         )

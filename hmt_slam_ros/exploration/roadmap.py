@@ -100,6 +100,10 @@ _MIN_ROOM_KEYFRAMES = 3
 """Keyframes in an entered room, at least."""
 
 
+SAME_FRONTIER_DISTANCE = 0.7
+"""Frontiers nearer to each other than this are one, m."""
+
+
 @dataclass(frozen=True, eq=False)
 class Frontier:
     """The end of known ground, or an unvisited room.

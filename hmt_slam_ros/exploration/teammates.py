@@ -11,6 +11,7 @@ import math
 from collections.abc import Container, Mapping
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.exploration.roadmap import SAME_FRONTIER_DISTANCE
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.map_changes import ForeignGround
 
@@ -58,14 +59,16 @@ class Teammates:
         return {name: keyframe for name, keyframe in newest.items() if keyframe is not None}
 
 
-def group_frontiers(positions: Mapping[int, Float64]) -> dict[int, int]:
+def group_frontiers(frontiers: Mapping[int, tuple[bool, Float64]]) -> dict[int, int]:
     """{frontier: one of its room, or of its end of a hallway}: who goes to one sees the others.
 
-    :param positions: {frontier: where it is, shape (2,), m} of those in rooms, or of those in hallways.
+    :param frontiers: {frontier: whether it is in a hallway, and where it is, shape (2,), m}.
     """
     groups: dict[int, int] = {}
-    for frontier, position in positions.items():
-        near = (n for n in set(groups.values()) if math.dist(position, positions[n]) <= _SEEN_FROM_THERE)
+    for frontier, (is_in_hallway, position) in sorted(frontiers.items(), key=lambda item: item[1][0]):
+        is_first = {n: groups[n] == n and frontiers[n][0] == is_in_hallway for n in groups}
+        reach = {n: _SEEN_FROM_THERE if is_first[n] else SAME_FRONTIER_DISTANCE for n in groups}
+        near = (groups[n] for n in groups if math.dist(position, frontiers[n][1]) <= reach[n])
         groups[frontier] = min(near, default=frontier)
     return groups
 
