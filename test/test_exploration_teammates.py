@@ -69,6 +69,21 @@ def test_of_two_robots_that_are_as_near_one_goes_and_never_both_stand():
         assert 0 in (of_ann, of_bob)
 
 
+def test_of_two_robots_that_are_as_near_never_both_go_where_there_is_more():
+    random = np.random.default_rng(6)
+    for _ in range(1000):
+        ann, bob = random.uniform(0.0, 10.0, 2)
+        shown_ann, shown_bob = random.uniform(-2.5, 2.5, 2) + np.array([ann, bob])
+        far = {1: (ROOM, 50.0), 2: (ROOM, 60.0)}
+        of_ann = choose_frontier(
+            {0: (ROOM, ann), **far}, {"bob": {0: (ROOM, shown_bob), **far}}, {0: 0, 1: 1, 2: 2}, "ann"
+        )
+        of_bob = choose_frontier(
+            {0: (ROOM, bob), **far}, {"ann": {0: (ROOM, shown_ann), **far}}, {0: 0, 1: 1, 2: 2}, "bob"
+        )
+        assert None not in (of_ann, of_bob) and (of_ann, of_bob) != (0, 0)
+
+
 def test_where_a_robot_is_shows_in_its_newest_ground():
     teammates = Teammates()
     teammates.add(ground("bob", -2, -3))

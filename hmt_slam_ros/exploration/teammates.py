@@ -78,21 +78,36 @@ def choose_frontier(
 ) -> int | None:
     """The frontier that is this robot's, None where all are left to others.
 
-    Of two robots that are as near to one the first by name goes. It takes the other to be farther away by twice the
-    error of its path: so never both leave it to each other.
+    Where two may be as near to a frontier, the first by name goes: the other one takes it to be nearer by twice the
+    error of its path, and finds something else. So never both go. Where all is left to others like this, the first by
+    name takes the others to be farther away by as much instead: so never both stand.
 
     :param own: {frontier: its cost for this robot}.
     :param others: {other robot: the same, from its newest keyframe on}.
     :param groups: {frontier: its group}, which one robot explores.
     :param robot: name of this robot.
     """
-    costs: dict[str, Mapping[int, Cost]] = {robot: own}
-    for name, each in others.items():
-        lag = 2.0 * _LAG if robot < name else 0.0
-        costs[name] = {frontier: (is_last, path + lag) for frontier, (is_last, path) in each.items()}
+    cautious = {name: -2.0 * _LAG if name < robot else 0.0 for name in others}
+    chosen = _assign({robot: own} | _shifted(others, cautious), groups).get(robot)
+    if chosen is not None:
+        return chosen
+    bold = {name: 2.0 * _LAG if robot < name else 0.0 for name in others}
+    return _assign({robot: own} | _shifted(others, bold), groups).get(robot)
+
+
+def _shifted(costs: Mapping[str, Mapping[int, Cost]], shifts: Mapping[str, float]) -> dict[str, dict[int, Cost]]:
+    """The costs of robots with other lengths of their paths."""
+    return {
+        name: {frontier: (is_last, path + shifts[name]) for frontier, (is_last, path) in each.items()}
+        for name, each in costs.items()
+    }
+
+
+def _assign(costs: Mapping[str, Mapping[int, Cost]], groups: Mapping[int, int]) -> dict[str, int]:
+    """{robot: its frontier}: the cheapest pair first."""
     pairs = sorted((cost, name, frontier) for name, each in costs.items() for frontier, cost in each.items())
     assigned: dict[str, int] = {}
     for _, name, frontier in pairs:
         if name not in assigned and groups[frontier] not in {groups[each] for each in assigned.values()}:
             assigned[name] = frontier
-    return assigned.get(robot)
+    return assigned
