@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 
 from hmt_slam_ros.configuration import Configuration, flat_parameters
 from hmt_slam_ros.errors import HmtSlamError
-from hmt_slam_ros.ros.parameters import ConfiguredNode, declare_laser_poses
+from hmt_slam_ros.ros.parameters import ConfiguredNode, declare_laser_poses, declare_robot_name
 
 
 @pytest.fixture
@@ -183,3 +183,9 @@ def test_a_laser_pose_is_three_numbers(make):
         declare_laser_poses(make("-p", "laser_pose:=[0.1, 0.0, 0.0]"), ["front", "rear"])
     with pytest.raises(HmtSlamError, match="is no pose"):
         declare_laser_poses(make("-p", "laser_pose:=[0.1, .nan, 0.0]"), ["scan"])
+
+
+def test_the_name_of_a_robot_is_its_namespace_unless_it_has_another_one(make):
+    assert declare_robot_name(make()) == ""
+    assert declare_robot_name(make("-r", "__ns:=/hall/ann")) == "hall.ann"
+    assert declare_robot_name(make("-r", "__ns:=/hall/ann", "-p", "robot_name:=bob")) == "bob"

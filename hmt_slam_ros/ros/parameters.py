@@ -140,9 +140,14 @@ def declare_system(node: Node) -> SystemName:
     return SystemName(str(node.declare_parameter("system", "", descriptor).value))
 
 
-def name_in_team(node: Node) -> str:
-    """The name that a robot has in its team by its namespace, empty without one."""
-    return node.get_namespace().strip("/").replace("/", ".")
+def declare_robot_name(node: Node) -> str:
+    """Declare ``robot_name``, and return the name of the robot in its team; empty without it and a namespace."""
+    descriptor = ParameterDescriptor(
+        description="Name of the robot in its team, the same for all its nodes; empty for its namespace.",
+        read_only=True,
+    )
+    name = str(node.declare_parameter("robot_name", "", descriptor).value)
+    return name or node.get_namespace().strip("/").replace("/", ".")
 
 
 def declare_frame(node: Node, which: str, default: str, note: str = "") -> str:

@@ -40,7 +40,7 @@ from hmt_slam_ros.ros.laser_mountings import LaserMountings
 from hmt_slam_ros.ros.map_publisher import MapPublisher
 from hmt_slam_ros.ros.message_io import Inbox, subscribe_document
 from hmt_slam_ros.ros.odometry_frames import BASE_FRAME, OdometryFrames, declare_odometry_frame
-from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_poses, name_in_team
+from hmt_slam_ros.ros.parameters import declare_frame, declare_laser_poses, declare_robot_name
 from hmt_slam_ros.ros.room_markers import RoomMarkers
 from hmt_slam_ros.ros.task_interface import TaskHost, TaskInterface, TaskProcess
 from hmt_slam_ros.ros.task_scans import TaskScans
@@ -297,6 +297,11 @@ class ExplorerNode(TaskNode):
         """Whether it publishes velocity commands."""
         return self.configuration.explorer.drive == "velocities"
 
+    def declare_own_parameters(self) -> None:
+        """As any task node; also declare the name in the team."""
+        super().declare_own_parameters()
+        self._robot = declare_robot_name(self)
+
     def make_process(self, initial_state: InitialState) -> TaskProcess:
         """The explorer of a map, or of an unknown building."""
         from hmt_slam_ros.exploration.explorer import Explorer  # noqa: PLC0415  takes time
@@ -304,7 +309,7 @@ class ExplorerNode(TaskNode):
         document = initial_state.map
         self.area_poses = GlobalPoses((_FIRST_AREA_POSE,) if document is None else document.area_poses)
         known = None if document is None else Replica.from_state(document.replica)
-        explorer = Explorer(self.configuration, known, name_in_team(self))
+        explorer = Explorer(self.configuration, known, self._robot)
         if self.configuration.explorer.explores:
             explorer.handle(Task("explore"))
         return explorer

@@ -27,7 +27,7 @@ from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import gaussian_from_message, stamp_from_time, transform_message
 from hmt_slam_ros.ros.initial_state import InitialState
 from hmt_slam_ros.ros.message_io import subscribe_document
-from hmt_slam_ros.ros.parameters import declare_frame, name_in_team
+from hmt_slam_ros.ros.parameters import declare_frame, declare_robot_name
 from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.topics import DOCUMENTS, RENDEZVOUS, transform_publisher
 
@@ -49,7 +49,6 @@ _PROFILES: dict[type, QoSProfile] = {
     TeamPlacement: topics.TEAM_HISTORY,
     TeamRendezvous: topics.TEAM_HISTORY,
 }
-_ROBOT_NAME = ParameterDescriptor(description="Name of the robot in its team; empty for its namespace.", read_only=True)
 _BANDWIDTH = ParameterDescriptor(
     description="Most bytes a second, on average, of the map that is sent to other robots.",
     read_only=True,
@@ -71,8 +70,7 @@ class TeamNode(ProcessNode):
         super().declare_own_parameters()
         self._map_frame, self._team_frame = declare_frame(self, "map", "map"), declare_frame(self, "team", "team")
         self._bandwidth = float(self.declare_parameter("team_bandwidth", 100_000.0, _BANDWIDTH).value)
-        name = str(self.declare_parameter("robot_name", "", _ROBOT_NAME).value)
-        self._robot = name or name_in_team(self)
+        self._robot = declare_robot_name(self)
         if not self._robot:
             raise HmtSlamError("the robot has no name in its team: start its nodes in a namespace, or set robot_name")
 
