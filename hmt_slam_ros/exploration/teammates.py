@@ -88,14 +88,14 @@ def choose_frontier(
     :param robot: name of this robot.
     """
     cautious = {name: -2.0 * _LAG if name < robot else 0.0 for name in others}
-    chosen = _assign({robot: own} | _shifted(others, cautious), groups).get(robot)
+    chosen = _assign({robot: own} | _shift(others, cautious), groups).get(robot)
     if chosen is not None:
         return chosen
     bold = {name: 2.0 * _LAG if robot < name else 0.0 for name in others}
-    return _assign({robot: own} | _shifted(others, bold), groups).get(robot)
+    return _assign({robot: own} | _shift(others, bold), groups).get(robot)
 
 
-def _shifted(costs: Mapping[str, Mapping[int, Cost]], shifts: Mapping[str, float]) -> dict[str, dict[int, Cost]]:
+def _shift(costs: Mapping[str, Mapping[int, Cost]], shifts: Mapping[str, float]) -> dict[str, dict[int, Cost]]:
     """The costs of robots with other lengths of their paths."""
     return {
         name: {frontier: (is_last, path + shifts[name]) for frontier, (is_last, path) in each.items()}
