@@ -263,7 +263,8 @@ def test_ground_of_a_joined_robot_is_known_before_the_maps_are_compared_again():
     unknown = {"ann": ForeignMapState(ann.session)}
     ground = {}
     for is_joined in (False, True):
-        state = replace(bob, others=unknown, joins={"ann": JoinState(is_joined)})
+        join = JoinState(bob.joins["ann"].pose) if is_joined else JoinState()
+        state = replace(bob, others=unknown, joins={"ann": join})
         team = Team(with_changes(CONFIGURATION, {"team.uses_ground": True}), state)
         waiting, answers = [ann.status], []
         while waiting:

@@ -1,12 +1,14 @@
-"""Joins of two robots' maps that grow: by a placement that was sure before, until it is no longer probable."""
+"""Joins of two robots' maps that grow: by a placement that was sure before, while it is the most probable one."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 from hmt_slam_ros.configuration.tree import Configuration
+from hmt_slam_ros.messages.map_changes import Pose
 from hmt_slam_ros.messages.team import JoiningArc, Verdict
 from hmt_slam_ros.team.join import Meeting
+from hmt_slam_ros.team.placement import is_same_placement
 
 _MIN_PROBABILITY = 0.5
 """Probability of the best placement below which a join is withdrawn."""
@@ -16,14 +18,31 @@ _MIN_PROBABILITY = 0.5
 class JoinState:
     """How far the join with another robot's map is.
 
-    :ivar is_joined: whether the two maps are joined.
+    :ivar pose: shape (3,), ``first_T_second``, of the placement by which the two maps are joined, as of the last
+        comparison; None where they are not joined.
     :ivar joining_arcs: of the join, with ``team.uses_ground``; none without.
     :ivar sent_version: of the other map, up to which its ground was sent to TLCA.
     """
 
-    is_joined: bool = False
+    pose: Pose | None = None
     joining_arcs: tuple[JoiningArc, ...] = ()
     sent_version: int = 0
+
+    @property
+    def is_joined(self) -> bool:
+        """Whether the two maps are joined."""
+        return self.pose is not None
+
+    def holds(self, meeting: Meeting) -> bool:
+        """Whether two joined maps stay so after a comparison: at the same placement, which is still probable.
+
+        No two answers at the border of what is sure alternate. Maps that grow may bend, so that the pose is compared
+        with that of the last comparison.
+        """
+        best = meeting.distribution.best
+        if self.pose is None or best is None or meeting.verdict not in (Verdict.JOINED, Verdict.OPEN):
+            return False
+        return best.probability >= _MIN_PROBABILITY and is_same_placement(self.pose, best.pose)
 
 
 def next_join(
@@ -34,13 +53,14 @@ def next_join(
     :param is_first: whether the first component is the robot's own.
     :param has_lasted: whether the placement was sure before, too: many are tried, so that it joins only then.
     """
-    if join.is_joined and not _may_hold(meeting):
-        return JoinState()
-    if meeting.verdict is not Verdict.JOINED or not (join.is_joined or has_lasted):
+    join, best = join if join.holds(meeting) else JoinState(), meeting.distribution.best
+    is_sure = meeting.verdict is Verdict.JOINED and (join.is_joined or has_lasted)
+    if best is None or not (join.is_joined or is_sure):
         return join
     # Registration takes longer than the comparison, and only those who use the ground need the arcs.
-    arcs = _joining_arcs(join, meeting, configuration, is_first=is_first) if configuration.team.uses_ground else ()
-    return replace(join, is_joined=True, joining_arcs=arcs)
+    if is_sure and configuration.team.uses_ground:
+        join = replace(join, joining_arcs=_joining_arcs(join, meeting, configuration, is_first=is_first))
+    return replace(join, pose=best.pose)
 
 
 def _joining_arcs(
@@ -67,10 +87,3 @@ def _joining_arcs(
             own = JoiningArc(known, number, arc.pose) if is_first else JoiningArc(number, known, arc.pose.inverse())
             arcs[own.own_area, own.foreign_area] = own
     return tuple(arcs.values())
-
-
-def _may_hold(meeting: Meeting) -> bool:
-    """Whether a join holds: no two answers at the border of what is sure alternate."""
-    best = meeting.distribution.best
-    is_possible = meeting.verdict in (Verdict.JOINED, Verdict.OPEN)
-    return is_possible and best is not None and best.probability >= _MIN_PROBABILITY

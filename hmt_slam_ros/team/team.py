@@ -351,12 +351,12 @@ class Team:
         meeting = pair.meeting = judge(pair.search, self._configuration)
         pair.is_judged = True
         first, second = sorted((self._robot, name))
-        before = pair.join
-        has_lasted = before.is_joined or was_sure(pair.search, meeting, self._configuration)
+        before, holds = pair.join, pair.join.holds(meeting)
+        has_lasted = holds or was_sure(pair.search, meeting, self._configuration)
         is_first = self._robot == first
         pair.join = next_join(before, meeting, self._configuration, is_first=is_first, has_lasted=has_lasted)
-        is_withdrawn = before.is_joined and not pair.join.is_joined
-        ground = self._withdraw_ground(name) if is_withdrawn else self._new_ground(name)
+        withdrawn = self._withdraw_ground(name) if before.is_joined and not holds else []
+        ground = [*withdrawn, *self._new_ground(name)]
         now = _placement(self._robot, first, second, meeting)
         if meeting.verdict in (Verdict.JOINED, Verdict.OPEN):
             now = replace(now, verdict=Verdict.JOINED if pair.join.is_joined else Verdict.OPEN)
