@@ -105,8 +105,12 @@ def _progress(result):
 def test_three_robots_join_in_pairs():
     placements = []
     logs = halves(OFFICE, ("ann", "bob"), 0.6) | {"cid": halves(OFFICE, ("cid", "-"), 0.6)["cid"]}
-    run = TeamRun(CONFIGURATION, logs, lambda _, each: placements.append(each))
+    sent = []
+    run = TeamRun(CONFIGURATION, logs, lambda _, each: placements.append(each), lambda _, each: sent.append(each))
     run.run()
+    # Each version goes to both others at once, and no message is lost.
+    updates = [(each.robot, each.after) for each in sent if isinstance(each, TeamUpdate)]
+    assert len(updates) == len(set(updates)) > 10
     for name, team in run.teams.items():
         assert {other: met.verdict for other, met in team.meetings.items()} == dict.fromkeys(
             logs.keys() - {name}, Verdict.JOINED
@@ -162,6 +166,13 @@ def test_another_session_of_a_robot_is_another_map():
     network.pass_messages()
     assert network.new.handle(TeamStatus("ann", "later", 3, "0", 0.0)) == [TeamRequest("zoe", "ann", "later", 0)]
     assert not component(network.new, "ann").scans
+
+
+def test_a_status_with_another_repetition_does_not_show_that_an_update_was_lost():
+    team, status = Team(CONFIGURATION, TeamState("zoe", "s")), TeamStatus("ann", "s", 3, "0", 0.0)
+    assert team.handle(status) == [TeamRequest("zoe", "ann", "s", 0)]
+    assert team.handle(replace(status, log_repetition=-0.1)) == []
+    assert team.handle(replace(status, log_repetition=-0.1)) == [TeamRequest("zoe", "ann", "s", 0)]
 
 
 def test_a_map_of_another_session_is_joined_with_nothing():

@@ -78,8 +78,13 @@ class TeamRun:
     def run(self, on_state: Callable[[str, RunState], None] | None = None) -> dict[str, RunResult]:
         """Map all logs to their ends, and finish the search; the result of each robot.
 
+        All know of one another from the start, as nodes do by the statuses that they repeat.
+
         :param on_state: called with each robot and its state after its last record, before ``EndOfLog``.
         """
+        for radio in self._radios.values():
+            radio.sent.append(radio.team.status)
+        self._exchange()
         for seconds, name, record in heapq.merge(*map(self._timed_records, self._logs), key=itemgetter(0)):
             self._seconds = seconds
             self.runs[name].process_record(record)

@@ -213,7 +213,7 @@ class Team:
     def _on_status(self, status: TeamStatus) -> list[Message]:
         """Request what the robot's map has more than is known here.
 
-        While a request is under way, a newer status waits for its answer. Where the same status comes again, and
+        While a request is under way, a newer status waits for its answer. Where the very same status comes again, and
         nothing has arrived meanwhile, the answer was lost. The own status lets the search go on.
         """
         name = status.robot
@@ -226,9 +226,10 @@ class Team:
             known = self._others[name] = _Other(ForeignMapState(status.session))
             self._pairs[name] = _PairState(self._configuration, JoinState())
             self._forget_placements(name)
-        if known.map.log_repetition != status.log_repetition:
+        is_again = known.map.log_repetition == status.log_repetition
+        if not is_again:
             known.map.log_repetition, self._pairs[name].is_outdated = status.log_repetition, True
-        is_stuck = (known.newest, known.arrived) == (status.map_version, known.map.version)
+        is_stuck = is_again and (known.newest, known.arrived) == (status.map_version, known.map.version)
         known.newest, known.arrived = max(known.newest, status.map_version), known.map.version
         if known.requested == known.map.version and not is_stuck:
             return []
