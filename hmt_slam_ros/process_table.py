@@ -175,7 +175,7 @@ COMPANIONS: tuple[NodeRow, ...] = (
         "explorer",
         "exploration",
         f"{_ROS}.task_nodes:ExplorerNode",
-        ("Task", "Scan", "RealTimePose", "Keyframe", "Hypotheses", "ClosureDecision", "Ambiguity"),
+        ("Task", "Scan", "RealTimePose", "Keyframe", "Hypotheses", "ClosureDecision", "Ambiguity", "TeamGoal"),
     ),
     NodeRow(
         "pilot",
@@ -220,6 +220,7 @@ DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow(f"{_TEAM}:TeamUpdate", "/team/updates", "team_update", 2),
     DocumentRow(f"{_TEAM}:TeamPlacement", "/team/placements", "team_placement", 1),
     DocumentRow(f"{_TEAM}:TeamRendezvous", "/team/rendezvous", "team_rendezvous", 1),
+    DocumentRow(f"{_TEAM}:TeamGoal", "/team/goals", "team_goal", 1),
 )
 """Messages that travel as JSON documents."""
 

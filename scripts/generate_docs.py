@@ -168,7 +168,7 @@ _FURTHER_PUBLISHED: dict[str, tuple[str, ...]] = {
     "rtl": ("tf",),
     "team": ("tf",),
     "robot": ("scan", "odom", "/clock", "hmt/robot_status", "tf", "tf_static", "ground_truth", "marks"),
-    "explorer": _TASK_TOPICS,
+    "explorer": (*_TASK_TOPICS, "/team/goals"),
     "pilot": (*_TASK_TOPICS, "pilot/place_estimate", "initialpose"),
     "view": ("hmt/incidents",),
     "operator": (

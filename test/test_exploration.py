@@ -168,7 +168,7 @@ def share_ground(own: _Explored, places: list[tuple[float, float, float]]) -> No
 
 def target_in_building(explorer: Explorer) -> Float64:
     """The frontier to which an explorer drives, (2,), m."""
-    target, locator = explorer._target, explorer.exploration_map.keyframe_locator
+    target, locator = explorer._frontiers.target, explorer.exploration_map.keyframe_locator
     assert target is not None
     return se2.transform(locator.keyframe_pose(target.keyframe), target.path[-1]) + ORIGIN[:2]
 

@@ -7,6 +7,7 @@ import worlds
 from hmt_slam_ros.exploration.teammates import Teammates, choose_frontier, group_frontiers
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.map_changes import ForeignGround, ForeignKeyframe
+from hmt_slam_ros.messages.team import MAX_ROBOTS, TeamGoal, TeamPlace
 
 HALLWAY, ROOM = False, True
 SCAN = worlds.scan_in(worlds.box(-5.0, -5.0, 5.0, 5.0), (0.0, 0.0, 0.0), stamp=0)
@@ -104,3 +105,39 @@ def test_nothing_is_left_to_a_robot_that_maps_no_more():
     teammates.add(ground("bob"))
     teammates.update(170 * NANOSECONDS)
     assert teammates.positions({-2, -3}) == {"cid": -3}
+
+
+def goal(robot, place=None):
+    return TeamGoal(robot, 0, False, place, False, 5.0)
+
+
+def test_goals_of_other_robots_are_kept():
+    teammates = Teammates("ann")
+    teammates.add_goal(goal("ann"))
+    assert not (teammates.goals or teammates.has_new_goals)
+    for n in range(MAX_ROBOTS + 5):
+        teammates.add_goal(goal(f"robot {n}"))
+    assert teammates.has_new_goals and len(teammates.goals) == MAX_ROBOTS
+    teammates.add_goal(goal("robot 1", TeamPlace("ann", 1, np.zeros(3))))
+    assert teammates.goals["robot 1"].last(0).place is not None
+
+
+def test_an_explorer_without_a_name_is_in_no_team():
+    teammates = Teammates()
+    teammates.add_goal(goal("bob"))
+    assert not teammates.goals
+
+
+def test_robots_know_a_place_by_the_stamp_of_a_scan():
+    """Keyframes have other numbers in the map of each robot."""
+    scans = [worlds.scan_in(worlds.box(-5.0, -5.0, 5.0, 5.0), (0.0, 0.0, 0.0), stamp=n) for n in range(4)]
+    ann, bob = Teammates("ann"), Teammates("bob")
+    ann.add(ForeignGround("bob", (ForeignKeyframe(-2, 3, np.zeros(3), scans[2]),)))
+    bob.add(ForeignGround("ann", (ForeignKeyframe(-7, 3, np.zeros(3), scans[1]),)))
+    of_ann, of_bob = {0: scans[0], 1: scans[1], -2: scans[2]}, {0: scans[1], 4: scans[2], -7: scans[1]}
+    for keyframe, same in ((1, -7), (-2, 4), (0, None)):
+        assert bob.keyframe_of(ann.place_at(keyframe, np.zeros(3), of_ann), of_bob) == same
+    assert ann.place_at(-2, np.zeros(3), of_ann).owner == "bob"
+    # Another robot's keyframe of the same stamp is another one.
+    assert bob.keyframe_of(TeamPlace("bob", 1, np.zeros(3)), of_bob) == 0
+    assert bob.keyframe_of(TeamPlace("cid", 1, np.zeros(3)), of_bob) is None

@@ -40,7 +40,7 @@ from hmt_slam_ros.messages.messages import (
     TrackingReset,
 )
 from hmt_slam_ros.messages.tasks import PlaceEstimate, TaskFeedback
-from hmt_slam_ros.messages.team import JoinedGround, TeamMessage, Verdict
+from hmt_slam_ros.messages.team import JoinedGround, TeamGoal, TeamMessage, Verdict
 from hmt_slam_ros.messages.topology import Topology
 from hmt_slam_ros.plain_data import field_names, is_record
 from hmt_slam_ros.registration.consistency import Clutter
@@ -65,6 +65,7 @@ KINDS = (
     TaskFeedback,
     Ambiguity,
     *get_args(TeamMessage),
+    TeamGoal,
     JoinedGround,
     Topology,
     Alternatives,

@@ -15,8 +15,9 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.messages.documents import decode
+from hmt_slam_ros.messages.documents import decode, encode
 from hmt_slam_ros.messages.tasks import TaskFeedback
+from hmt_slam_ros.messages.team import TeamGoal, TeamPlace
 from hmt_slam_ros.process_table import process_names
 from hmt_slam_ros.ros import topics
 from hmt_slam_ros.ros.conversions import keyframe_frame, pose_from_message, pose_message
@@ -49,6 +50,28 @@ class SecondLaser:
             scan.angle_min -= REAR_ANGLE
             scan.angle_max -= REAR_ANGLE
             self._scans.publish(scan)
+
+
+class Bob:
+    """Another robot of the team, which sends two goals, of which the second is none."""
+
+    def __init__(self, listener):
+        self._listener, self._goals = listener, listener.subscribe(String, "/team/goals", topics.TEAM_HISTORY)
+        self._publisher = listener.node.create_publisher(String, "/team/goals", topics.TEAM_HISTORY)
+        for goal in (
+            TeamGoal("bob", 9, False, TeamPlace("bob", 7, np.zeros(3)), False, 5.0),
+            TeamGoal("bob", 9, False, None, False, -1.0),
+        ):
+            self._publisher.publish(String(data=encode(goal)))
+
+    def assert_goals_were_exchanged(self, reports):
+        """Ann has sent where she drives to, and at last that it is nowhere; she has refused what makes no sense."""
+        self._listener.until(lambda: decode(self._goals[-1].data, TeamGoal).place is None)
+        goals = [decode(message.data, TeamGoal) for message in self._goals]
+        places = [goal.place for goal in goals[:-1] if goal.robot == "ann"]
+        assert places and {place.owner for place in places} == {"ann"}
+        values = [value for report in reports for value in report.status[0].values if value.key.endswith("/team/goals")]
+        assert {(value.key, value.value) for value in values} == {("refused on /team/goals", "1")}
 
 
 @pytest.fixture
@@ -85,14 +108,16 @@ def test_it_explores_goes_where_it_is_sent_and_restarts_with_another_map(listene
     truths = listener.subscribe(PoseStamped, "ground_truth", topics.STREAM)
     feedback = listener.subscribe(String, TASK_FEEDBACK, topics.STREAM)
     reports = listener.subscribe(DiagnosticArray, DIAGNOSTICS, topics.STREAM)
-    second = SecondLaser(listener)
-    nodes = system(sensors__scan_topics="scan,scan_rear", laser_pose=f"[0.0,0.0,0.0,0.0,0.0,{REAR_ANGLE}]")
+    second, bob = SecondLaser(listener), Bob(listener)
+    nodes = system(
+        robot_name="ann", sensors__scan_topics="scan,scan_rear", laser_pose=f"[0.0,0.0,0.0,0.0,0.0,{REAR_ANGLE}]"
+    )
     assert_stands_beside_a_silent_laser(listener, nodes, reports, truths)
     second.is_on = True
     listener.until(lambda: outcomes, alive=nodes)
     assert_feedback_is_of_exploring(feedback)
-    answer = listener.call(Trigger, "explorer/cancel", Trigger.Request())
-    assert (answer.success, answer.message) == (False, "there is no task to cancel")
+    bob.assert_goals_were_exchanged(reports)
+    assert_there_is_nothing_to_cancel(listener)
     explored = "explore: all is known that can be reached; 0 places were given up"
     assert outcomes[0].data == explored
     path = np.array([pose_from_message(message.pose)[:2] for message in truths])
@@ -136,6 +161,11 @@ def assert_feedback_is_of_exploring(messages):
     reported = [decode(message.data, TaskFeedback) for message in messages]
     assert {each.task for each in reported} == {"explore"}
     assert max(each.distance_remaining or 0.0 for each in reported) > 0.5
+
+
+def assert_there_is_nothing_to_cancel(listener):
+    answer = listener.call(Trigger, "explorer/cancel", Trigger.Request())
+    assert (answer.success, answer.message) == (False, "there is no task to cancel")
 
 
 def assert_room_is_the_arm(message):

@@ -9,7 +9,15 @@ import pytest
 
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.messages.team import JoinedGround, TeamPlacement, TeamRequest, TeamStatus, TeamUpdate, Verdict
+from hmt_slam_ros.messages.team import (
+    MAX_ROBOTS,
+    JoinedGround,
+    TeamPlacement,
+    TeamRequest,
+    TeamStatus,
+    TeamUpdate,
+    Verdict,
+)
 from hmt_slam_ros.offline.run import run_log
 from hmt_slam_ros.offline.team_run import TeamRun
 from hmt_slam_ros.open_log import open_log
@@ -18,7 +26,7 @@ from hmt_slam_ros.team import shared_map
 from hmt_slam_ros.team import team as team_module
 from hmt_slam_ros.team.join_state import JoinState
 from hmt_slam_ros.team.shared_map import ForeignMapState
-from hmt_slam_ros.team.team import MAX_ROBOTS, Team, TeamState
+from hmt_slam_ros.team.team import Team, TeamState
 
 CONFIGURATION = Configuration(seed=50)
 OFFICE, OTHER = "sim:office,size=0.7,seed=51", "sim:office,size=0.7,seed=50"

@@ -22,6 +22,7 @@ from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.tasks import (
     AnchoredPose,
 )
+from hmt_slam_ros.messages.team import TeamGoal
 
 _MAX_POSE_AGE = NANOSECONDS
 """Age up to which a pose of RTL is used, ns; RTL sends none while the robot is lost."""
@@ -40,13 +41,16 @@ class ExplorationMap:
     :ivar teammates: robots whose ground is part of the map.
     """
 
-    def __init__(self, configuration: Configuration, replica: Replica | None = None) -> None:
-        """:param replica: the initial map; None for an empty one."""
+    def __init__(self, configuration: Configuration, replica: Replica | None = None, robot: str = "") -> None:
+        """:param replica: the initial map; None for an empty one.
+
+        :param robot: its name in its team.
+        """
         self.roadmap = Roadmap.of_explorer(configuration)
         self.replica = replica or Replica()
         self.event = -1
         self.version = 0 if replica is None else 1
-        self.teammates = Teammates()
+        self.teammates = Teammates(robot)
         self._updated_at = NO_KEYFRAME
         self._pose: RealTimePose | None = None
         self._keyframe_locator: KeyframeLocator | None = None
@@ -68,6 +72,8 @@ class ExplorationMap:
                     self.teammates.add(message.foreign_ground)
         elif isinstance(message, RealTimePose):
             self._pose = message
+        elif isinstance(message, TeamGoal):
+            self.teammates.add_goal(message)
 
     @property
     def hybrid_map(self) -> HybridMap:

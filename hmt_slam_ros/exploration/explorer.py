@@ -15,13 +15,13 @@ import numpy as np
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.exploration.exploration_map import ExplorationMap
+from hmt_slam_ros.exploration.frontier_choice import FrontierChoice
 from hmt_slam_ros.exploration.laser_views import LaserViews, ObstacleView
 from hmt_slam_ros.exploration.local_motion import turn_in_place
 from hmt_slam_ros.exploration.look_planner import LookPlanner
 from hmt_slam_ros.exploration.path_follower import PathFollower, Route, motion_limits
 from hmt_slam_ros.exploration.pose_goals import anchor_elsewhere
-from hmt_slam_ros.exploration.roadmap import SAME_FRONTIER_DISTANCE, EntryPoint, Frontier
-from hmt_slam_ros.exploration.teammates import Cost, choose_frontier, group_frontiers
+from hmt_slam_ros.exploration.roadmap import EntryPoint
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.ambiguity import Ambiguity
@@ -60,7 +60,9 @@ _STAND = (0.0, 0.0)
 
 
 class Explorer:
-    """The explorer as a process. Consumes Task, Scan, RealTimePose, Ambiguity and the chain; produces tasks' messages.
+    """The explorer as a process. Consumes Task, Scan, RealTimePose, Ambiguity, TeamGoal and the chain.
+
+    It produces tasks' messages, and in a team TeamGoal.
 
     :ivar exploration_map: the known map.
     :ivar task: what it does; None without a task.
@@ -72,21 +74,16 @@ class Explorer:
         :param robot: its name in its team.
         """
         parameters = configuration.explorer
-        self._robot = robot
         self._limits = motion_limits(parameters)
         self._stuck_timeout = round(NANOSECONDS * parameters.stuck_timeout)
-        self.exploration_map = ExplorationMap(configuration, known)
+        self.exploration_map = ExplorationMap(configuration, known, robot)
+        self._frontiers = FrontierChoice(self.exploration_map)
         self.task: Task | None = None
         self._goal: AnchoredPose | None = None
         self._tries = 0
-        self._target: Frontier | None = None
         self._route: Route | None = None
         self._path_follower = PathFollower(self._limits, _PLACE_TOLERANCE)
         self._velocity, self._views = _STAND, LaserViews()
-        # Reached frontiers, and those given up: each a point in the frame of a keyframe.
-        self._reached_frontiers: list[tuple[int, Float64]] = []
-        self._abandoned_frontiers: list[tuple[int, Float64]] = []
-        self._may_retry = True
         self._max_path_entropy = configuration.places.max_entropy if parameters.backtracks else math.inf
         self._is_backtracking = False
         self._disambiguates = parameters.disambiguates
@@ -97,7 +94,8 @@ class Explorer:
         if isinstance(message, Task):
             self.task = None if message.kind == "stop" else message
             self._goal = message.goal
-            self._route, self._tries, self._may_retry = None, 0, True
+            self._route, self._tries = None, 0
+            self._frontiers.forget_target()
             self._look_planner.forget_tries()
         elif isinstance(message, Scan):
             return self._drive(message)
@@ -135,6 +133,7 @@ class Explorer:
             if self._route is None or self._has_news_of_others:
                 outputs += self._choose_goal(self.task, scan.stamp)
         self._velocity = self._follow_route(view, outputs) if ready and self._route is not None else _STAND
+        outputs += self._frontiers.share(scan.stamp, self.progress.remaining)
         return [*outputs, VelocityCommand(scan.stamp, *self._velocity)]
 
     def _move_views(self, stamp: int) -> None:
@@ -153,7 +152,8 @@ class Explorer:
             return self._is_looking and self._look_planner.keeps_target(self.exploration_map.keyframe_locator, robot)
         if self._is_backtracking or self._is_ambiguous:
             return self._is_backtracking and self._is_ambiguous
-        in_hallway = self._is_exploring and self._target is not None and self._target.is_in_hallway
+        target = self._frontiers.target
+        in_hallway = self._is_exploring and target is not None and target.is_in_hallway
         return not (in_hallway and self._path_follower.remaining < _RESELECT_DISTANCE)
 
     @property
@@ -162,9 +162,10 @@ class Explorer:
 
     @property
     def _has_news_of_others(self) -> bool:
-        """Whether new ground of another robot may change which frontier is this robot's."""
+        """Whether new ground or the goal of another robot may change which frontier is this robot's."""
+        teammates = self.exploration_map.teammates
         is_open = self._is_exploring and not (self._is_looking or self._is_backtracking)
-        return is_open and bool(self.exploration_map.teammates.new_keyframes)
+        return is_open and (bool(teammates.new_keyframes) or teammates.has_new_goals)
 
     @property
     def _is_ambiguous(self) -> bool:
@@ -207,11 +208,9 @@ class Explorer:
         if self._is_looking or self._is_backtracking:
             return []
         if self._is_exploring:
-            assert self._target is not None
-            frontiers = self._reached_frontiers if reached else self._abandoned_frontiers
-            frontiers.append((self._target.keyframe, self._target.path[-1]))
-            self._may_retry |= reached
-            if reached and not self._target.is_in_hallway:
+            self._frontiers.end_target(reached=reached)
+            target = self._frontiers.target
+            if reached and target is not None and not target.is_in_hallway:
                 self.exploration_map.name_current_room()
             return []
         self._tries += 1
@@ -224,6 +223,7 @@ class Explorer:
     def _finish_task(self, text: str, *, reached: bool, error: TaskError = TaskError.UNKNOWN) -> list[Message]:
         assert self.task is not None
         result = TaskResult(self.task, reached, text, error)
+        self._frontiers.forget_target()
         self.task = self._route = self._goal = None
         return [result]
 
@@ -259,75 +259,25 @@ class Explorer:
 
         Where all are left to others the robot stands, as hallways may branch; where only rooms are left, the task ends.
         """
-        roadmap = self.exploration_map.roadmap
-        left = [number for number, frontier in enumerate(roadmap.frontiers) if not self._was_tried(frontier)]
-        costs = self._frontier_costs(here.keyframe, left)
-        if not costs:
+        choice = self._frontiers.choose(here.keyframe, is_on_way=self._route is not None)
+        if choice.frontier is None:
             self._route = None
-            return self._retry_or_finish()
-        others = self.exploration_map.teammates.positions(roadmap.graph)
-        costs_of_others = {name: self._frontier_costs(k, costs) for name, k in others.items()}
-        groups = self._frontier_groups(costs)
-        number = choose_frontier(costs, costs_of_others, groups, self._robot)
-        if number is None:
-            self._route = None
-            rooms = {groups[number] for number, (is_in_room, _) in costs.items() if is_in_room}
-            return self._retry_or_finish(others) if rooms.issuperset(groups.values()) else []
-        target = roadmap.frontiers[number]
-        if self._route is not None and self._is_target(target):
-            return []
-        self._target = target
-        self._set_route(here, roadmap.shortest_path(here.keyframe, target.keyframe), target.path, _FRONTIER_TOLERANCE)
+            may_finish = choice.is_over and not self._frontiers.retry()
+            return self._finish_exploration(choice.left_to) if may_finish else []
+        if choice.is_new:
+            path = self.exploration_map.roadmap.shortest_path(here.keyframe, choice.frontier.keyframe)
+            self._set_route(here, path, choice.frontier.path, _FRONTIER_TOLERANCE)
         return []
 
-    def _frontier_costs(self, start: int, numbers: Iterable[int]) -> dict[int, Cost]:
-        """{number: cost from a keyframe on} of those frontiers that can be reached."""
-        roadmap = self.exploration_map.roadmap
-        distances = roadmap.distances(start)
-        frontiers = {number: roadmap.frontiers[number] for number in numbers}
-        return {
-            number: (not frontier.is_in_hallway, distances[frontier.keyframe] + frontier.length)
-            for number, frontier in frontiers.items()
-            if frontier.keyframe in distances
-        }
+    def _finish_exploration(self, left_to: Iterable[str]) -> list[Message]:
+        """End the task.
 
-    def _is_target(self, frontier: Frontier) -> bool:
-        """Whether the robot is on its way to a frontier."""
-        assert self._target is not None
-        distance = math.dist(self._position(frontier), self._position(self._target))
-        return distance < SAME_FRONTIER_DISTANCE
-
-    def _frontier_groups(self, numbers: Iterable[int]) -> dict[int, int]:
-        """{number: group}: one robot of a team explores a group."""
-        frontiers = {number: self.exploration_map.roadmap.frontiers[number] for number in numbers}
-        return group_frontiers({n: (each.is_in_hallway, self._position(each)) for n, each in frontiers.items()})
-
-    def _position(self, frontier: Frontier) -> Float64:
-        """Where a frontier is, in the frame of the robot's area, shape (2,)."""
-        pose = self.exploration_map.keyframe_locator.keyframe_pose(frontier.keyframe)
-        return se2.transform(pose, frontier.path[-1])
-
-    def _retry_or_finish(self, others: Iterable[str] = ()) -> list[Message]:
-        """Retry frontiers that were given up, maybe because of people, while any of them is reached; else finish.
-
-        :param others: robots to which rooms are left.
+        :param left_to: robots to which rooms are left.
         """
-        if self._abandoned_frontiers and self._may_retry:
-            self._may_retry, self._abandoned_frontiers = False, []
-            return []
-        left = len(self._abandoned_frontiers)
-        left_to = f", or left to {' and '.join(others)}" if others else ""
-        text = f"all is known that can be reached{left_to}; {left} places were given up"
+        others = f", or left to {' and '.join(left_to)}" if left_to else ""
+        count = self._frontiers.abandoned_count
+        text = f"all is known that can be reached{others}; {count} places were given up"
         return self._finish_task(text, reached=True)
-
-    def _was_tried(self, frontier: Frontier) -> bool:
-        """Whether a frontier was reached or given up."""
-        locator, position = self.exploration_map.keyframe_locator, self._position(frontier)
-        return any(
-            math.dist(position, se2.transform(locator.keyframe_pose(keyframe), point)) < SAME_FRONTIER_DISTANCE
-            for keyframe, point in self._reached_frontiers + self._abandoned_frontiers
-            if keyframe in locator
-        )
 
     def _plan_to_place(self, here: EntryPoint) -> list[Message]:
         """Plan to a named place."""

@@ -122,6 +122,12 @@ class Frontier:
         """Length of the path, m."""
         return float(np.hypot(*np.diff(self.path, axis=0).T).sum())
 
+    @property
+    def end(self) -> Float64:
+        """The pose at the end of the path, shape (3,), in the frame of the keyframe's base, m and rad."""
+        towards = self.path[-1] - self.path[-2:][0]
+        return np.array([*self.path[-1], math.atan2(towards[1], towards[0])])
+
 
 class EntryPoint(NamedTuple):
     """A path between the roadmap and a pose.

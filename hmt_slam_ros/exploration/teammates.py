@@ -1,8 +1,8 @@
 """The other robots of a team in an exploration: what they have mapped, and which frontiers are left to them.
 
-Frontiers are assigned greedily, the cheapest pair of a robot and a frontier first (Burgard, Moors, Stachniss and
-Schneider 2005). Who goes to a frontier sees those around it, which lose their utility for the rest. Robots
-that are joined have the same map, up to what is under way.
+Explorers share their goals. Where the goal of another one is not known, frontiers are assigned greedily, the cheapest
+pair of a robot and a frontier first (Burgard, Moors, Stachniss and Schneider 2005). Who goes to a frontier sees those
+around it, which lose their utility for the rest. Robots that are joined have the same map, up to what is under way.
 """
 
 from __future__ import annotations
@@ -10,19 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Container, Mapping
 
-from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.exploration.roadmap import SAME_FRONTIER_DISTANCE
+from hmt_slam_ros.exploration.team_goals import LAG, SEEN_FROM_THERE, Cost, FrontierPlace, GoalsOfRobot
 from hmt_slam_ros.logs.stamps import NANOSECONDS
-from hmt_slam_ros.messages.map_changes import ForeignGround
-
-Cost = tuple[bool, float]
-"""Of a frontier for a robot: whether it is in no hallway, then the path to it, m."""
-
-_LAG = 2.5
-"""By how much the path of another robot may be wrong, m: it is shown where it was up to five keyframes ago."""
-
-_SEEN_FROM_THERE = 5.0
-"""Distance of two frontiers in rooms, or of two in hallways, up to which one robot explores both, m."""
+from hmt_slam_ros.messages.map_changes import ForeignGround, Pose
+from hmt_slam_ros.messages.team import MAX_ROBOTS, TeamGoal, TeamPlace
+from hmt_slam_ros.sensors import Scan
 
 _TIMEOUT = 60 * NANOSECONDS
 """Time without new ground after which nothing is left to a robot: it may have stopped, ns."""
@@ -31,14 +24,21 @@ _TIMEOUT = 60 * NANOSECONDS
 class Teammates:
     """The robots whose ground is part of the map.
 
-    :ivar new_keyframes: keyframes of theirs that the roadmap does not have yet, in the order in which they came.
+    :ivar robot: name of this robot in its team, empty without one.
+    :ivar new_keyframes: keyframes of others that the roadmap does not have yet, in the order in which they came.
+    :ivar stamp: time of the last update, ns.
+    :ivar has_new_goals: whether others have sent goals since this was set to False.
+    :ivar goals: {robot: goals} of those that have sent any.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, robot: str = "") -> None:
+        self.robot = robot
         self.new_keyframes: list[int] = []
+        self.has_new_goals = False
         self._keyframes: dict[str, list[int]] = {}
         self._arrived: dict[str, int] = {}
-        self._stamp = 0
+        self.goals: dict[str, GoalsOfRobot] = {}
+        self.stamp = 0
 
     def add(self, ground: ForeignGround) -> None:
         """Note new ground of a robot."""
@@ -46,28 +46,55 @@ class Teammates:
             keyframes = [each.keyframe for each in ground.keyframes]
             self.new_keyframes += keyframes
             self._keyframes.setdefault(ground.robot, []).extend(keyframes)
-            self._arrived[ground.robot] = self._stamp
+            self._arrived[ground.robot] = self.stamp
+            if ground.robot in self.goals:
+                self.goals[ground.robot].add_ground(max(each.scan.stamp for each in ground.keyframes))
+
+    def add_goal(self, goal: TeamGoal) -> None:
+        """Note to where a robot drives; a team has one robot of a name."""
+        has_room = goal.robot in self.goals or len(self.goals) < MAX_ROBOTS
+        if self.robot and goal.robot != self.robot and has_room:
+            self.goals.setdefault(goal.robot, GoalsOfRobot()).add(goal, self.stamp)
+            self.has_new_goals = True
 
     def update(self, stamp: int) -> None:
         """Note the time, ns."""
-        self._stamp = stamp
+        self.stamp = stamp
+
+    def place_at(self, keyframe: int, pose: Pose, scans: Mapping[int, Scan]) -> TeamPlace:
+        """A place beside a keyframe as all robots know it.
+
+        :param pose: ``keyframe_T_place``, shape (3,), m and rad.
+        :param scans: {keyframe: scan}.
+        """
+        owners = (name for name, keyframes in self._keyframes.items() if keyframe in keyframes)
+        return TeamPlace(next(owners, self.robot), scans[keyframe].stamp, pose)
+
+    def keyframe_of(self, place: TeamPlace, scans: Mapping[int, Scan]) -> int | None:
+        """The keyframe of a place, None where it is not in the map.
+
+        :param scans: {keyframe: scan} of the map.
+        """
+        own = (keyframe for keyframe in scans if keyframe >= 0)
+        keyframes = own if place.owner == self.robot else self._keyframes.get(place.owner, ())
+        return next((k for k in keyframes if k in scans and scans[k].stamp == place.stamp), None)
 
     def positions(self, roadmap: Container[int]) -> dict[str, int]:
         """{robot: its newest keyframe in a roadmap} of those that explore, and have one."""
-        exploring = [name for name in self._keyframes if self._stamp - self._arrived[name] <= _TIMEOUT]
+        exploring = [name for name in self._keyframes if self.stamp - self._arrived[name] <= _TIMEOUT]
         newest = {name: next((k for k in self._keyframes[name][::-1] if k in roadmap), None) for name in exploring}
         return {name: keyframe for name, keyframe in newest.items() if keyframe is not None}
 
 
-def group_frontiers(frontiers: Mapping[int, tuple[bool, Float64]]) -> dict[int, int]:
+def group_frontiers(frontiers: Mapping[int, FrontierPlace]) -> dict[int, int]:
     """{frontier: one of its room, or of its end of a hallway}: who goes to one sees the others.
 
-    :param frontiers: {frontier: whether it is in a hallway, and where it is, shape (2,), m}.
+    :param frontiers: {frontier: its place}.
     """
     groups: dict[int, int] = {}
     for frontier, (is_in_hallway, position) in sorted(frontiers.items(), key=lambda item: item[1][0]):
         is_first = {n: groups[n] == n and frontiers[n][0] == is_in_hallway for n in groups}
-        reach = {n: _SEEN_FROM_THERE if is_first[n] else SAME_FRONTIER_DISTANCE for n in groups}
+        reach = {n: SEEN_FROM_THERE if is_first[n] else SAME_FRONTIER_DISTANCE for n in groups}
         near = (groups[n] for n in groups if math.dist(position, frontiers[n][1]) <= reach[n])
         groups[frontier] = min(near, default=frontier)
     return groups
@@ -76,7 +103,7 @@ def group_frontiers(frontiers: Mapping[int, tuple[bool, Float64]]) -> dict[int, 
 def choose_frontier(
     own: Mapping[int, Cost], others: Mapping[str, Mapping[int, Cost]], groups: Mapping[int, int], robot: str
 ) -> int | None:
-    """The frontier that is this robot's, None where all are left to others.
+    """The frontier that is this robot's, None where all are left to others, whose goals are not known.
 
     Where two may be as near to a frontier, the first by name goes: the other one takes it to be nearer by twice the
     error of its path, and finds something else. So never both go. Where all is left to others like this, the first by
@@ -87,11 +114,11 @@ def choose_frontier(
     :param groups: {frontier: its group}, which one robot explores.
     :param robot: name of this robot.
     """
-    cautious = {name: -2.0 * _LAG if name < robot else 0.0 for name in others}
+    cautious = {name: -2.0 * LAG if name < robot else 0.0 for name in others}
     chosen = _assign({robot: own} | _shift(others, cautious), groups).get(robot)
     if chosen is not None:
         return chosen
-    bold = {name: 2.0 * _LAG if robot < name else 0.0 for name in others}
+    bold = {name: 2.0 * LAG if robot < name else 0.0 for name in others}
     return _assign({robot: own} | _shift(others, bold), groups).get(robot)
 
 

@@ -38,6 +38,7 @@ from hmt_slam_ros.messages.team import (
     JoinedGround,
     SharedArea,
     SharedScan,
+    TeamGoal,
     TeamMessage,
     TeamPlacement,
     TeamRendezvous,
@@ -88,6 +89,7 @@ _COUNTS = frozenset(
         "target",
         "previous_area",
         "stamp",
+        "newest_stamp",
         "version",
         "map_version",
         "after",
@@ -146,6 +148,8 @@ def _check_kind(message: object) -> None:
         _check_response(message)
     elif isinstance(message, TeamMessage | JoinedGround):
         _check_team_message(message)
+    elif isinstance(message, TeamGoal):
+        _check_goal(message)
 
 
 def _check_marks(marks: Iterable[MarkObservation]) -> None:
@@ -283,8 +287,7 @@ def _check_response(response: SaveResponse | ResetResponse) -> None:
 def _check_team_message(message: TeamMessage | JoinedGround) -> None:
     """Check the names, and what an update or a placement holds."""
     for name in ("robot", "session", "owner", "first", "second", "other", "digest"):
-        value = getattr(message, name, "-")
-        _require(bool(_TEAM_NAME.fullmatch(value)), name, value, "a name of 100 letters, digits and '_-.:+' at most")
+        _check_team_name(name, getattr(message, name, "-"))
     if isinstance(message, TeamUpdate):
         for item in message.items:
             _require(message.after < item.version <= message.until, "version", item.version, "one of the update")
@@ -302,6 +305,17 @@ def _check_team_message(message: TeamMessage | JoinedGround) -> None:
         _require(message.robot in (message.first, message.second), "robot", message.robot, "a robot of the pair")
         for probability in (message.probability, message.apart):
             _require(0.0 <= probability <= 1.0, "probability", probability, "between 0 and 1")
+
+
+def _check_goal(goal: TeamGoal) -> None:
+    _check_team_name("robot", goal.robot)
+    _require(0.0 <= goal.remaining <= MAX_COORDINATE, "remaining", goal.remaining, "0 to 1e7 m")
+    if goal.place is not None:
+        _check_team_name("owner", goal.place.owner)
+
+
+def _check_team_name(name: str, value: str) -> None:
+    _require(bool(_TEAM_NAME.fullmatch(value)), name, value, "a name of 100 letters, digits and '_-.:+' at most")
 
 
 def _check_items(scans: Iterable[SharedScan], areas: Iterable[SharedArea]) -> None:

@@ -32,7 +32,7 @@ from hmt_slam_ros.messages.map_changes import (
 )
 from hmt_slam_ros.messages.statements import PlaceStatement, WeighedStatement
 from hmt_slam_ros.messages.tasks import GoalPose, PlaceEstimate, Task, TaskResult, VelocityCommand
-from hmt_slam_ros.messages.team import JoinedGround, TeamMessage
+from hmt_slam_ros.messages.team import JoinedGround, TeamGoal, TeamMessage
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import MarkObservation, Odometry, Scan
 
@@ -404,5 +404,6 @@ Message = (
     | VelocityCommand
     | PlaceEstimate
     | TeamMessage
+    | TeamGoal
     | JoinedGround
 )

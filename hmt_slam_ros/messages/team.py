@@ -13,6 +13,9 @@ from hmt_slam_ros.sensors import Scan
 MAX_TEAM_AREAS, MAX_TEAM_KEYFRAMES = 2**16, 2**32
 """Bounds of the numbers of areas and keyframes in the map of a robot of a team."""
 
+MAX_ROBOTS = 16
+"""Other robots of a team: they bound the memory."""
+
 MAX_LOG_REPETITION = 50.0
 """Largest log Bayes factor of a building that repeats itself, nats: its exponential stays finite."""
 
@@ -167,6 +170,40 @@ class TeamRendezvous:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class TeamPlace:
+    """A place beside a keyframe that robots of a team share.
+
+    :ivar owner: name of the robot that mapped the keyframe.
+    :ivar stamp: of its scan, on the clock of that robot, ns.
+    :ivar pose: shape (3,), ``keyframe_T_place``, m and rad.
+    """
+
+    owner: str
+    stamp: int
+    pose: Pose
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TeamGoal:
+    """An explorer -> the explorers of all other robots: the frontier to which it drives.
+
+    :ivar robot: name of the robot.
+    :ivar newest_stamp: of the newest keyframe in its map then, on its clock, ns.
+    :ivar reached_last: whether it reached its goal before this one.
+    :ivar place: where the frontier is; None where it drives to none.
+    :ivar is_in_hallway: whether the frontier is expected in a hallway; else in a room, or nowhere.
+    :ivar remaining: length of the path to it, m; 0 where there is none.
+    """
+
+    robot: str
+    newest_stamp: int
+    reached_last: bool
+    place: TeamPlace | None
+    is_in_hallway: bool
+    remaining: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class JoiningArc:
     """An arc that joins the maps of two robots.
 
@@ -199,4 +236,4 @@ class JoinedGround:
 
 
 TeamMessage = TeamStatus | TeamRequest | TeamUpdate | TeamPlacement | TeamRendezvous
-"""What robots of a team send one another."""
+"""What the processes ``team`` of several robots send one another."""

@@ -155,14 +155,15 @@ class LockStepRun:
             self._log_reader.begin_log(log)
         return self._log_reader.unread_records(log)
 
-    def process_record(self, record: LogRecord) -> None:
-        """Process a record."""
-        self.lock_step.feed(record.measurement)
+    def process_record(self, record: LogRecord) -> list[Message]:
+        """Process a record; returns the messages that it caused."""
+        caused = self.lock_step.feed(record.measurement)
         self._log_reader.mark_read(record)
         if isinstance(record.measurement, Scan):
             spent = self.lock_step.take_seconds()
             for name, seconds in self._seconds_per_scan.items():
                 seconds.append(spent.get(name, 0.0))
+        return caused
 
     def finish(self) -> RunResult:
         """End the run and return its result."""

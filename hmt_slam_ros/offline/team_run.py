@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from operator import itemgetter
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.logs.records import Log, LogRecord
-from hmt_slam_ros.messages.messages import Message
+from hmt_slam_ros.messages.messages import ClosureDecision, Message
 from hmt_slam_ros.messages.routing import Process
-from hmt_slam_ros.messages.team import JoinedGround, TeamPlacement
+from hmt_slam_ros.messages.team import JoinedGround, TeamGoal, TeamPlacement
 from hmt_slam_ros.offline.lock_step import LockStepRun, RunResult
 from hmt_slam_ros.process_table import TEAM
 from hmt_slam_ros.results.hmt_map import RunState
+from hmt_slam_ros.team.standing import StandingTimer
 from hmt_slam_ros.team.team import Team, TeamState
 
 _SESSION = "lock-step"
@@ -22,16 +23,30 @@ _SESSION = "lock-step"
 
 
 class _Radio:
-    """The process team of a robot, whose messages wait for the others."""
+    """The process team of a robot; its messages, and those of the explorer, wait for the others."""
 
     def __init__(self, team: Team) -> None:
         self.team = team
         self.sent: deque[Message] = deque()
+        self._standing = StandingTimer()
 
     def handle(self, message: Message) -> list[Message]:
         """Let the process handle a message; the robot's other processes need no answer."""
         self.sent += self.team.handle(message)
         return []
+
+    def note_record(self, seconds: float, caused: Sequence[Message]) -> None:
+        """Send the goals of the explorer, and let a process whose robot stands go on.
+
+        :param seconds: time of a record, s.
+        :param caused: messages that it caused.
+        """
+        self.sent += [message for message in caused if isinstance(message, TeamGoal)]
+        if any(isinstance(message, ClosureDecision) for message in caused):
+            self._standing.note_event(seconds)
+        elif self._standing.is_due(seconds, is_searching=self.team.is_searching):
+            self._standing.note_status(seconds)
+            self.handle(self.team.status)
 
 
 class TeamRun:
@@ -87,7 +102,7 @@ class TeamRun:
         self._exchange()
         for seconds, name, record in heapq.merge(*map(self._timed_records, self._logs), key=itemgetter(0)):
             self._seconds = seconds
-            self.runs[name].process_record(record)
+            self._radios[name].note_record(seconds, self.runs[name].process_record(record))
             self._exchange()
         if on_state:
             for name, run in self.runs.items():
@@ -123,5 +138,7 @@ class TeamRun:
         if self._on_sent:
             self._on_sent(sender, message)
         for name, radio in self._radios.items():
-            if name != sender:
+            if name != sender and isinstance(message, TeamGoal):
+                self.runs[name].lock_step.feed(message)
+            elif name != sender:
                 radio.handle(message)

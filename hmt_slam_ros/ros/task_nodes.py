@@ -16,7 +16,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.shortest_path import is_uninformative
 from hmt_slam_ros.messages.documents import ResetRequest, encode
-from hmt_slam_ros.messages.gate import check_belief
+from hmt_slam_ros.messages.gate import check_belief, decode_of_team
 from hmt_slam_ros.messages.map_changes import AreaPose, InitialPose
 from hmt_slam_ros.messages.messages import ClosureDecision, Message, PoseReset, RealTimePose
 from hmt_slam_ros.messages.replica import FIRST_AREA, GlobalPoses, Replica
@@ -32,6 +32,7 @@ from hmt_slam_ros.messages.tasks import (
     TaskResult,
     VelocityCommand,
 )
+from hmt_slam_ros.messages.team import TeamGoal
 from hmt_slam_ros.ros import conversions, topics
 from hmt_slam_ros.ros.diagnostics import PERIOD
 from hmt_slam_ros.ros.execution import spin_until
@@ -46,6 +47,7 @@ from hmt_slam_ros.ros.task_interface import TaskHost, TaskInterface, TaskProcess
 from hmt_slam_ros.ros.task_scans import TaskScans
 from hmt_slam_ros.ros.topics import (
     CMD_VEL,
+    DOCUMENTS,
     GOAL_POSE,
     HMT_POSE,
     INITIAL_POSE,
@@ -123,7 +125,7 @@ class TaskNode(TaskHost):
         TaskScans(self, LaserMountings(self, self.diagnostics, frames, self._laser_poses), self._process_scan)
         self._inbox = Inbox(
             self,
-            SUBSCRIPTIONS[self._name],
+            [kind for kind in SUBSCRIPTIONS[self._name] if kind is not TeamGoal],
             self.on_message,
             self.diagnostics,
             first_event=initial_state.events,
@@ -301,6 +303,28 @@ class ExplorerNode(TaskNode):
         """As any task node; also declare the name in the team."""
         super().declare_own_parameters()
         self._robot = declare_robot_name(self)
+
+    def configure_node(self) -> None:
+        """As any task node; in a team, also exchange goals with the other explorers.
+
+        :raises HmtSlamError: as any task node.
+        """
+        super().configure_node()
+        self._team_goals = self.create_publisher(String, DOCUMENTS[TeamGoal], topics.TEAM_HISTORY)
+        self.create_subscription(String, DOCUMENTS[TeamGoal], self._on_team_goal, topics.TEAM_HISTORY)
+
+    def _on_team_goal(self, message: String) -> None:
+        """Let the explorer know where another one drives; its own goals come here, too."""
+        goal = decode_of_team(message.data, TeamGoal)
+        if goal.robot != self._robot:
+            self.process_message(goal)
+
+    def publish_output(self, message: Message) -> None:
+        """As any task node; a goal goes to the other explorers."""
+        if isinstance(message, TeamGoal):
+            self._team_goals.publish(String(data=encode(message)))
+        else:
+            super().publish_output(message)
 
     def make_process(self, initial_state: InitialState) -> TaskProcess:
         """The explorer of a map, or of an unknown building."""

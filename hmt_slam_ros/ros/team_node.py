@@ -30,14 +30,13 @@ from hmt_slam_ros.ros.message_io import subscribe_document
 from hmt_slam_ros.ros.parameters import declare_frame, declare_robot_name
 from hmt_slam_ros.ros.process_node import ProcessNode
 from hmt_slam_ros.ros.topics import DOCUMENTS, RENDEZVOUS, transform_publisher
+from hmt_slam_ros.team.standing import StandingTimer
 
 if TYPE_CHECKING:
     from hmt_slam_ros.team.team import Team
 
 _PERIOD = 0.1
 """Time between two transforms, and two looks at the updates that wait, s."""
-_STANDING_TIME, _SEARCH_PERIOD = 3.0, 0.5
-"""Time after the last keyframe event from which the search goes on by itself, and time between two such steps, s."""
 _STATUS_PERIOD = 5.0
 """Time between two statuses without a change, s: so long a robot waits for what was lost."""
 _MAX_WAITING = 64
@@ -82,7 +81,7 @@ class TeamNode(ProcessNode):
         super().configure_node()
         self._waiting: deque[tuple[TeamUpdate, String]] = deque()
         self._budget, self._budget_at = self._bandwidth, time.monotonic()
-        self._event_at = self._searched_at = self._status_at = 0.0
+        self._standing, self._status_at = StandingTimer(), 0.0
         self._sent_bytes = 0
         self._team_publishers = {
             kind: self.create_publisher(String, DOCUMENTS[kind], profile) for kind, profile in _PROFILES.items()
@@ -110,9 +109,9 @@ class TeamNode(ProcessNode):
         return Team(self.configuration, initial_state.read_part(self._name, TeamState) or fresh)
 
     def deliver(self, message: Message) -> None:
-        """As any process node; a keyframe event also lets the search go on."""
+        """As any process node; while keyframe events come, the robot does not stand."""
         if isinstance(message, ClosureDecision):
-            self._event_at = time.monotonic()
+            self._standing.note_event(time.monotonic())
         super().deliver(message)
 
     def publish_views(self, message: Message, outputs: list[Message]) -> None:
@@ -177,9 +176,8 @@ class TeamNode(ProcessNode):
         self._publish_transform()
         if not self.is_active:
             return
-        is_due = now - self._event_at > _STANDING_TIME and now - self._searched_at > _SEARCH_PERIOD
-        if is_due and self.process.is_searching:
-            self._searched_at = now
+        if self._standing.is_due(now, is_searching=self.process.is_searching):
+            self._standing.note_status(now)
             self.deliver(self.process.status)
         if now - self._status_at > _STATUS_PERIOD:
             self._publish_to_team(self.process.status)

@@ -106,8 +106,11 @@ class SharedMap:
         """Of all items, hexadecimal."""
         return _combine_digests(self._digests.values())
 
-    def take_over(self, replica: Replica) -> bool:
-        """Share what is definite in the maps of all hypotheses, and the robot's own; whether something is new."""
+    def take_over(self, replica: Replica, *, is_standing: bool = False) -> bool:
+        """Share what is definite in the maps of all hypotheses, and the robot's own; whether something is new.
+
+        :param is_standing: whether the robot's own area is shared whatever is new in it, as no more may come.
+        """
         before = self.version
         hybrid_map, undecided = _agreed_map(replica)
         areas = hybrid_map.area_ids()
@@ -115,7 +118,7 @@ class SharedMap:
             hybrid_map = own_ground(hybrid_map)
             areas = hybrid_map.area_ids()
         arcs_of = _arcs_by_larger_area(hybrid_map)
-        occupied = set(replica.robot_areas.values())
+        occupied = set[int]() if is_standing else set(replica.robot_areas.values())
         for item in self._areas():
             if item.area not in undecided and not hybrid_map.has_area(item.area):
                 self._contents.pop(item.area, None)

@@ -11,6 +11,7 @@ from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Keyframe, Message
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.messages.team import (
+    MAX_ROBOTS,
     MAX_TEAM_AREAS,
     MAX_TEAM_KEYFRAMES,
     JoinedGround,
@@ -29,9 +30,6 @@ from hmt_slam_ros.team.rendezvous import KnownRendezvous
 from hmt_slam_ros.team.repetition import RepetitionTest
 from hmt_slam_ros.team.shared_map import ForeignMap, ForeignMapState, SharedMap, SharedMapState
 from hmt_slam_ros.team.team_frame import team_poses
-
-MAX_ROBOTS = 16
-"""Other robots of a team: they bound the memory."""
 
 _SHIFT = Shift(MAX_TEAM_AREAS, MAX_TEAM_KEYFRAMES)
 """Added to the numbers of the second component of a pair, beyond those of any robot's map."""
@@ -167,7 +165,10 @@ class Team:
         return texts
 
     def handle(self, message: Message) -> list[Message]:
-        """Process a message of the robot's own chain, or of another robot; the own status lets the search go on."""
+        """Process a message of the robot's own chain, or of another robot.
+
+        The own status comes while the robot stands: all of its area is shared, and the search goes on.
+        """
         match message:
             case Keyframe() | Hypotheses() | ClosureDecision():
                 return self._follow_chain(message)
@@ -198,8 +199,8 @@ class Team:
         clutter = {each.hypothesis: each.clutter for each in keyframe.estimates}
         self._shared.clutter = clutter.get(self._replica.best_hypothesis, self._shared.clutter)
 
-    def _share(self) -> list[Message]:
-        if not self._shared.take_over(self._replica):
+    def _share(self, *, is_standing: bool = False) -> list[Message]:
+        if not self._shared.take_over(self._replica, is_standing=is_standing):
             return []
         self._update_own()
         for pair in self._pairs.values():
@@ -214,11 +215,11 @@ class Team:
         """Request what the robot's map has more than is known here.
 
         While a request is under way, a newer status waits for its answer. Where the very same status comes again, and
-        nothing has arrived meanwhile, the answer was lost. The own status lets the search go on.
+        nothing has arrived meanwhile, the answer was lost. The own status shows that the robot stands.
         """
         name = status.robot
         if name == self._robot:
-            return self.search(_WORK, may_wait=False)
+            return [*self._share(is_standing=True), *self.search(_WORK, may_wait=False)]
         if name not in self._others and len(self._others) == MAX_ROBOTS:
             return []
         known = self._others.get(name)

@@ -8,11 +8,8 @@ import numpy as np
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.map_changes import Pose
-from hmt_slam_ros.messages.team import TeamPlacement
+from hmt_slam_ros.messages.team import MAX_ROBOTS, TeamPlacement
 from hmt_slam_ros.team.team_frame import team_poses
-
-MAX_ROBOTS = 16
-"""Robots that the page shows; further ones are left out."""
 
 
 class TeamSection:

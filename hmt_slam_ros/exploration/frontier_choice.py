@@ -1,0 +1,200 @@
+"""The frontiers of an exploration: which one a robot drives to, and which are left to the others of its team.
+
+Hallways come before rooms, and the nearest frontier first. A robot of a team sends its goal, and leaves alone what is
+the goal of another one (:mod:`hmt_slam_ros.exploration.team_goals`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import NamedTuple
+
+from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.exploration.exploration_map import ExplorationMap
+from hmt_slam_ros.exploration.roadmap import SAME_FRONTIER_DISTANCE, Frontier
+from hmt_slam_ros.exploration.team_goals import GOAL_PERIOD, Claim, Cost, unclaimed_frontiers
+from hmt_slam_ros.exploration.teammates import choose_frontier, group_frontiers
+from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.messages.messages import Message
+from hmt_slam_ros.messages.team import TeamGoal, TeamPlace
+
+
+class Choice(NamedTuple):
+    """What is left to explore.
+
+    :ivar frontier: the one to drive to; None where none is left.
+    :ivar is_new: whether it is another one than before.
+    :ivar left_to: other robots.
+    :ivar is_over: whether there is nothing to wait for: no frontier, or only rooms, which are left to others.
+    """
+
+    frontier: Frontier | None = None
+    is_new: bool = False
+    left_to: tuple[str, ...] = ()
+    is_over: bool = False
+
+
+class FrontierChoice:
+    """Chooses the frontiers of a robot.
+
+    :ivar target: the one that was chosen last; None without one.
+    """
+
+    def __init__(self, exploration_map: ExplorationMap) -> None:
+        self.target: Frontier | None = None
+        self._map = exploration_map
+        # Each a point in the frame of a keyframe.
+        self._reached: list[tuple[int, Float64]] = []
+        self._abandoned: list[tuple[int, Float64]] = []
+        self._may_retry = True
+        # The goal as it was sent last, when, and how far it was then.
+        self._sent: Frontier | None = None
+        self._sent_at, self._sent_length, self._path_length = 0, 0.0, 0.0
+        self._reached_it = False
+
+    @property
+    def abandoned_count(self) -> int:
+        """Number of frontiers that were given up."""
+        return len(self._abandoned)
+
+    def forget_target(self) -> None:
+        """Begin again without a target: a task begins or ends."""
+        self.target, self._may_retry = None, True
+
+    def end_target(self, *, reached: bool) -> None:
+        """Note that the target was reached, or given up."""
+        assert self.target is not None
+        (self._reached if reached else self._abandoned).append((self.target.keyframe, self.target.path[-1]))
+        self._may_retry |= reached
+        self._reached_it = reached
+
+    def retry(self) -> bool:
+        """Whether frontiers that were given up, maybe because of people, are tried again: if any was reached since."""
+        if not (self._abandoned and self._may_retry):
+            return False
+        self._may_retry, self._abandoned = False, []
+        return True
+
+    def choose(self, here: int, *, is_on_way: bool) -> Choice:
+        """Choose the next target.
+
+        :param here: keyframe at the robot.
+        :param is_on_way: whether it drives to the target of before.
+        """
+        team, roadmap = self._map.teammates, self._map.roadmap
+        team.has_new_goals = False
+        left = [number for number, frontier in enumerate(roadmap.frontiers) if not self._was_tried(frontier)]
+        costs = self._costs(here, left)
+        places = {n: (not is_in_room, self._position(roadmap.frontiers[n])) for n, (is_in_room, _) in costs.items()}
+        groups = group_frontiers(places)
+        claims, others = self._others()
+        free = unclaimed_frontiers(costs, places, claims, self._own_claim)
+        costs_of_others = {name: self._costs(keyframe, free) for name, keyframe in others.items()}
+        number = choose_frontier(free, costs_of_others, groups, team.robot)
+        if number is None:
+            self.target = None
+            rooms = {groups[n] for n, (is_in_room, _) in costs.items() if is_in_room}
+            return Choice(
+                left_to=tuple(sorted({*others, *(claim.robot for claim in claims)})),
+                is_over=rooms.issuperset(groups.values()),
+            )
+        if is_on_way and self._is_target(places[number][1]):
+            return Choice(self.target)
+        self.target, self._path_length = roadmap.frontiers[number], costs[number][1]
+        return Choice(self.target, is_new=True)
+
+    def share(self, stamp: int, remaining: float | None) -> list[Message]:
+        """What to send to the explorers of the other robots: the target when it is another one, and from time to time.
+
+        :param stamp: now, ns.
+        :param remaining: length of the path to the target, m, None where it is not known.
+        """
+        team, scans = self._map.teammates, self._map.replica.scans
+        is_due = self.target is not None and stamp - self._sent_at >= GOAL_PERIOD
+        if not team.robot or not (is_due or self.target is not self._sent):
+            return []
+        if self.target is not None and self.target.keyframe not in scans:
+            return []
+        # A new path has no remaining length before the robot follows it.
+        length = self._path_length if remaining is None or self.target is not self._sent else remaining
+        self._sent, self._sent_at, self._sent_length = self.target, stamp, length
+        goal = TeamGoal(team.robot, scans[max(scans)].stamp, self._reached_it, None, False, 0.0)
+        self._reached_it = False
+        if self.target is None:
+            return [goal]
+        place = team.place_at(self.target.keyframe, self.target.end, scans)
+        return [replace(goal, place=place, is_in_hallway=self.target.is_in_hallway, remaining=length)]
+
+    def _costs(self, start: int, numbers: Iterable[int]) -> dict[int, Cost]:
+        """{number: cost from a keyframe on} of those frontiers that can be reached."""
+        roadmap = self._map.roadmap
+        distances = roadmap.distances(start)
+        frontiers = {number: roadmap.frontiers[number] for number in numbers}
+        return {
+            number: (not frontier.is_in_hallway, distances[frontier.keyframe] + frontier.length)
+            for number, frontier in frontiers.items()
+            if frontier.keyframe in distances
+        }
+
+    def _others(self) -> tuple[list[Claim], dict[str, int]]:
+        """What others claim, and {robot: its newest keyframe} of those of which it is not known where they drive to."""
+        team = self._map.teammates
+        claims, others = list[Claim](), team.positions(self._map.roadmap.graph)
+        for name, goals in team.goals.items():
+            left = goals.left(team.stamp)
+            claims += self._claims_of(replace(goal, remaining=0.0) for goal, was_reached in left if was_reached)
+            last = goals.last(team.stamp)
+            if last is None:
+                continue
+            # A goal in ground that is still to come is where the robot drove to before, or behind that.
+            known = self._claims_of([last, *(replace(goal, remaining=last.remaining) for goal, _ in left[::-1])])
+            claims += known[:1] if last.place is not None else []
+            if last.place is None or known:
+                others.pop(name, None)
+        return claims, others
+
+    @property
+    def _own_claim(self) -> Claim | None:
+        """The robot's own claim, as it was sent."""
+        if self._sent is None or self._sent.keyframe not in self._map.keyframe_locator:
+            return None
+        place = self._sent.is_in_hallway, self._position(self._sent)
+        return Claim(self._map.teammates.robot, place, self._sent_length)
+
+    def _claims_of(self, goals: Iterable[TeamGoal]) -> list[Claim]:
+        """What goals claim, without those that are nowhere, or beside a keyframe that is not in the map."""
+        points = [(goal, None if goal.place is None else self._point_of(goal.place)) for goal in goals]
+        return [
+            Claim(goal.robot, (goal.is_in_hallway, point), goal.remaining)
+            for goal, point in points
+            if point is not None
+        ]
+
+    def _point_of(self, place: TeamPlace) -> Float64 | None:
+        """A place in the frame of the robot's area, shape (2,); None where its keyframe is not in the map."""
+        locator = self._map.keyframe_locator
+        keyframe = self._map.teammates.keyframe_of(place, self._map.replica.scans)
+        if keyframe is None or keyframe not in locator:
+            return None
+        return se2.transform(locator.keyframe_pose(keyframe), place.pose[:2])
+
+    def _is_target(self, position: Float64) -> bool:
+        """Whether the target is at a position."""
+        assert self.target is not None
+        return math.dist(position, self._position(self.target)) < SAME_FRONTIER_DISTANCE
+
+    def _position(self, frontier: Frontier) -> Float64:
+        """Where a frontier is, in the frame of the robot's area, shape (2,)."""
+        pose = self._map.keyframe_locator.keyframe_pose(frontier.keyframe)
+        return se2.transform(pose, frontier.path[-1])
+
+    def _was_tried(self, frontier: Frontier) -> bool:
+        """Whether a frontier was reached or given up."""
+        locator, position = self._map.keyframe_locator, self._position(frontier)
+        return any(
+            math.dist(position, se2.transform(locator.keyframe_pose(keyframe), point)) < SAME_FRONTIER_DISTANCE
+            for keyframe, point in self._reached + self._abandoned
+            if keyframe in locator
+        )
