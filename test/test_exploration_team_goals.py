@@ -74,6 +74,7 @@ def left(goals, now=0):
 def test_a_goal_that_was_left_counts_until_the_ground_from_there_has_arrived():
     goals = goals_of(goal(3), goal(3), goal(5, newest_stamp=7, reached_last=True), goal(newest_stamp=9))
     assert left(goals) == [3, -5]
+    assert [place.stamp for place in goals.reached] == [3]
     goals.add_ground(7)
     assert left(goals) == [-5]
     assert left(goals, 61 * NANOSECONDS) == []

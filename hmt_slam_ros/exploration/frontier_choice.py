@@ -85,6 +85,7 @@ class FrontierChoice:
         """
         team, roadmap = self._map.teammates, self._map.roadmap
         team.has_new_goals = False
+        self._take_over_reached()
         left = [number for number, frontier in enumerate(roadmap.frontiers) if not self._was_tried(frontier)]
         costs = self._costs(here, left)
         places = {n: (not is_in_room, self._position(roadmap.frontiers[n])) for n, (is_in_room, _) in costs.items()}
@@ -104,6 +105,17 @@ class FrontierChoice:
             return Choice(self.target)
         self.target, self._path_length = roadmap.frontiers[number], costs[number][1]
         return Choice(self.target, is_new=True)
+
+    def _take_over_reached(self) -> None:
+        """What other robots reached is reached for this one, too, as soon as its map has the keyframe beside it."""
+        team, scans = self._map.teammates, self._map.replica.scans
+        for goals in team.goals.values():
+            for place in [goals.reached.popleft() for _ in range(len(goals.reached))]:
+                keyframe = team.keyframe_of(place, scans)
+                if keyframe is None:
+                    goals.reached.append(place)
+                else:
+                    self._reached.append((keyframe, place.pose[:2]))
 
     def share(self, stamp: int, remaining: float | None) -> list[Message]:
         """What to send to the explorers of the other robots: the target when it is another one, and from time to time.

@@ -32,6 +32,9 @@ GOAL_PERIOD, _GOAL_TIMEOUT = 10 * NANOSECONDS, 30 * NANOSECONDS
 _MAX_LEFT, _LEFT_TIMEOUT = 8, 60 * NANOSECONDS
 """Most goals that a robot left which are kept, and the longest time for which they count, ns."""
 
+_MAX_REACHED = 64
+"""Most goals that a robot reached and that wait for its ground."""
+
 
 class _LeftGoal(NamedTuple):
     """A goal that a robot reached, or left for another one.
@@ -49,9 +52,13 @@ class _LeftGoal(NamedTuple):
 
 
 class GoalsOfRobot:
-    """The goals of another robot: the last one, and earlier ones until the map has its ground from there."""
+    """The goals of another robot: the last one, and earlier ones until the map has its ground from there.
+
+    :ivar reached: places of goals that it reached, which the explorer takes over once they are in its map.
+    """
 
     def __init__(self) -> None:
+        self.reached: deque[TeamPlace] = deque(maxlen=_MAX_REACHED)
         self._last: TeamGoal | None = None
         self._arrived = 0
         self._left: deque[_LeftGoal] = deque(maxlen=_MAX_LEFT)
@@ -64,6 +71,7 @@ class GoalsOfRobot:
         last = self._last
         if last is not None and last.place is not None and not _are_same(last.place, goal.place):
             self._left.append(_LeftGoal(last, goal.reached_last, goal.newest_stamp, now))
+            self.reached += [last.place] if goal.reached_last else []
         self._last, self._arrived = goal, now
 
     def add_ground(self, newest_stamp: int) -> None:
