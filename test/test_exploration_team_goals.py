@@ -47,7 +47,7 @@ def test_of_two_robots_with_one_goal_the_nearer_one_goes_on():
 def goal(stamp=None, newest_stamp=0, reached_last=False):
     """A goal beside the keyframe of a stamp."""
     place = None if stamp is None else TeamPlace("bob", stamp, np.zeros(3))
-    return TeamGoal("bob", newest_stamp, reached_last, place, False, 5.0)
+    return TeamGoal("bob", newest_stamp, reached_last, False, place, False, 5.0)
 
 
 def goals_of(*sent):

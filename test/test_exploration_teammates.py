@@ -108,7 +108,7 @@ def test_nothing_is_left_to_a_robot_that_maps_no_more():
 
 
 def goal(robot, place=None):
-    return TeamGoal(robot, 0, False, place, False, 5.0)
+    return TeamGoal(robot, 0, False, False, place, False, 5.0)
 
 
 def test_goals_of_other_robots_are_kept():

@@ -36,12 +36,12 @@ def estimate(covariance, x=0.0):
         SaveRequest(1, -1, "", False),
         SaveResponse(1, "stranger", ()),
         SaveResponse(1, "aam", (FileRecord("../aam.json", 1, ""),)),
-        TeamGoal("ann", 9, False, TeamPlace("bob", 7, np.zeros(3)), False, -1.0),
-        TeamGoal("ann", 9, False, TeamPlace("bob", 7, np.full(3, 1e8)), False, 5.0),
-        TeamGoal("ann", 9, False, TeamPlace("bob", -7, np.zeros(3)), False, 5.0),
-        TeamGoal("ann", 9, False, TeamPlace("a b", 7, np.zeros(3)), False, 5.0),
-        TeamGoal("", 9, False, None, False, 0.0),
-        TeamGoal("ann", -9, False, None, False, 0.0),
+        TeamGoal("ann", 9, False, False, TeamPlace("bob", 7, np.zeros(3)), False, -1.0),
+        TeamGoal("ann", 9, False, False, TeamPlace("bob", 7, np.full(3, 1e8)), False, 5.0),
+        TeamGoal("ann", 9, False, False, TeamPlace("bob", -7, np.zeros(3)), False, 5.0),
+        TeamGoal("ann", 9, False, False, TeamPlace("a b", 7, np.zeros(3)), False, 5.0),
+        TeamGoal("", 9, False, False, None, False, 0.0),
+        TeamGoal("ann", -9, False, False, None, False, 0.0),
     ],
 )
 def test_a_message_that_makes_no_sense_is_refused(message):

@@ -59,8 +59,8 @@ class Bob:
         self._listener, self._goals = listener, listener.subscribe(String, "/team/goals", topics.TEAM_HISTORY)
         self._publisher = listener.node.create_publisher(String, "/team/goals", topics.TEAM_HISTORY)
         for goal in (
-            TeamGoal("bob", 9, False, TeamPlace("bob", 7, np.zeros(3)), False, 5.0),
-            TeamGoal("bob", 9, False, None, False, -1.0),
+            TeamGoal("bob", 9, False, False, TeamPlace("bob", 7, np.zeros(3)), False, 5.0),
+            TeamGoal("bob", 9, False, False, None, False, -1.0),
         ):
             self._publisher.publish(String(data=encode(goal)))
 

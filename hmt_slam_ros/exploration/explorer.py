@@ -277,7 +277,9 @@ class Explorer:
         others = f", or left to {' and '.join(left_to)}" if left_to else ""
         count = self._frontiers.abandoned_count
         text = f"all is known that can be reached{others}; {count} places were given up"
-        return self._finish_task(text, reached=True)
+        outputs = self._finish_task(text, reached=True)
+        self._frontiers.finish()
+        return outputs
 
     def _plan_to_place(self, here: EntryPoint) -> list[Message]:
         """Plan to a named place."""

@@ -14,7 +14,13 @@ from typing import NamedTuple
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.exploration.exploration_map import ExplorationMap
 from hmt_slam_ros.exploration.roadmap import SAME_FRONTIER_DISTANCE, Frontier
-from hmt_slam_ros.exploration.team_goals import GOAL_PERIOD, Claim, Cost, unclaimed_frontiers
+from hmt_slam_ros.exploration.team_goals import (
+    GOAL_PERIOD,
+    Claim,
+    Cost,
+    are_seen_together,
+    unclaimed_frontiers,
+)
 from hmt_slam_ros.exploration.teammates import choose_frontier, group_frontiers
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.messages import Message
@@ -52,6 +58,9 @@ class FrontierChoice:
         # The goal as it was sent last, when, and how far it was then.
         self._sent: Frontier | None = None
         self._sent_at, self._sent_length, self._path_length = 0, 0.0, 0.0
+        self._has_finished = self._sent_finished = False
+        # Robots whose explorations have ended.
+        self._finished = set[str]()
         self._reached_it = False
 
     @property
@@ -61,7 +70,11 @@ class FrontierChoice:
 
     def forget_target(self) -> None:
         """Begin again without a target: a task begins or ends."""
-        self.target, self._may_retry = None, True
+        self.target, self._may_retry, self._has_finished = None, True, False
+
+    def finish(self) -> None:
+        """Note that the exploration has ended."""
+        self.target, self._has_finished = None, True
 
     def end_target(self, *, reached: bool) -> None:
         """Note that the target was reached, or given up."""
@@ -86,7 +99,8 @@ class FrontierChoice:
         team, roadmap = self._map.teammates, self._map.roadmap
         team.has_new_goals = False
         self._take_over_reached()
-        left = [number for number, frontier in enumerate(roadmap.frontiers) if not self._was_tried(frontier)]
+        self._finished = {name for name, goals in team.goals.items() if goals.has_finished}
+        left = [n for n, each in enumerate(roadmap.frontiers) if not (self._was_tried(each) or self._is_finished(each))]
         costs = self._costs(here, left)
         places = {n: (not is_in_room, self._position(roadmap.frontiers[n])) for n, (is_in_room, _) in costs.items()}
         groups = group_frontiers(places)
@@ -125,14 +139,16 @@ class FrontierChoice:
         """
         team, scans = self._map.teammates, self._map.replica.scans
         is_due = self.target is not None and stamp - self._sent_at >= GOAL_PERIOD
-        if not team.robot or not (is_due or self.target is not self._sent):
+        is_new = self.target is not self._sent or self._has_finished != self._sent_finished
+        if not (team.robot and scans and (is_due or is_new)):
             return []
         if self.target is not None and self.target.keyframe not in scans:
             return []
         # A new path has no remaining length before the robot follows it.
         length = self._path_length if remaining is None or self.target is not self._sent else remaining
         self._sent, self._sent_at, self._sent_length = self.target, stamp, length
-        goal = TeamGoal(team.robot, scans[max(scans)].stamp, self._reached_it, None, False, 0.0)
+        self._sent_finished = self._has_finished
+        goal = TeamGoal(team.robot, scans[max(scans)].stamp, self._reached_it, self._has_finished, None, False, 0.0)
         self._reached_it = False
         if self.target is None:
             return [goal]
@@ -210,3 +226,14 @@ class FrontierChoice:
             for keyframe, point in self._reached + self._abandoned
             if keyframe in locator
         )
+
+    def _is_finished(self, frontier: Frontier) -> bool:
+        """Whether a frontier is beside a keyframe of a robot whose exploration has ended, and not this robot's goal.
+
+        That robot's own map shows more of what is there. What it left to this one is near this one's goal.
+        """
+        owner = self._map.teammates.owner_of(frontier.keyframe)
+        if owner not in self._finished:
+            return False
+        claim, place = self._own_claim, (frontier.is_in_hallway, self._position(frontier))
+        return claim is None or not are_seen_together(claim.place, place)

@@ -78,6 +78,11 @@ class GoalsOfRobot:
         """Note that the map has the robot's ground up to a keyframe of that stamp, on the robot's clock, ns."""
         self._left = deque((each for each in self._left if each.newest_stamp > newest_stamp), maxlen=_MAX_LEFT)
 
+    @property
+    def has_finished(self) -> bool:
+        """Whether the robot's exploration has ended."""
+        return self._last is not None and self._last.has_finished
+
     def last(self, now: int) -> TeamGoal | None:
         """The last goal, None where the robot no longer sends it; that it drives nowhere it sends once."""
         is_sent = self._last is not None and (self._last.place is None or now - self._arrived <= _GOAL_TIMEOUT)

@@ -36,6 +36,7 @@ class Teammates:
         self.new_keyframes: list[int] = []
         self.has_new_goals = False
         self._keyframes: dict[str, list[int]] = {}
+        self._owners: dict[int, str] = {}
         self._arrived: dict[str, int] = {}
         self.goals: dict[str, GoalsOfRobot] = {}
         self.stamp = 0
@@ -46,6 +47,7 @@ class Teammates:
             keyframes = [each.keyframe for each in ground.keyframes]
             self.new_keyframes += keyframes
             self._keyframes.setdefault(ground.robot, []).extend(keyframes)
+            self._owners |= dict.fromkeys(keyframes, ground.robot)
             self._arrived[ground.robot] = self.stamp
             if ground.robot in self.goals:
                 self.goals[ground.robot].add_ground(max(each.scan.stamp for each in ground.keyframes))
@@ -67,8 +69,11 @@ class Teammates:
         :param pose: ``keyframe_T_place``, shape (3,), m and rad.
         :param scans: {keyframe: scan}.
         """
-        owners = (name for name, keyframes in self._keyframes.items() if keyframe in keyframes)
-        return TeamPlace(next(owners, self.robot), scans[keyframe].stamp, pose)
+        return TeamPlace(self.owner_of(keyframe), scans[keyframe].stamp, pose)
+
+    def owner_of(self, keyframe: int) -> str:
+        """The robot that mapped a keyframe."""
+        return self._owners.get(keyframe, self.robot)
 
     def keyframe_of(self, place: TeamPlace, scans: Mapping[int, Scan]) -> int | None:
         """The keyframe of a place, None where it is not in the map.

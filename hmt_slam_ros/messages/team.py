@@ -190,6 +190,7 @@ class TeamGoal:
     :ivar robot: name of the robot.
     :ivar newest_stamp: of the newest keyframe in its map then, on its clock, ns.
     :ivar reached_last: whether it reached its goal before this one.
+    :ivar has_finished: whether its exploration has ended, so that no frontier is left beside its keyframes.
     :ivar place: where the frontier is; None where it drives to none.
     :ivar is_in_hallway: whether the frontier is expected in a hallway; else in a room, or nowhere.
     :ivar remaining: length of the path to it, m; 0 where there is none.
@@ -198,6 +199,7 @@ class TeamGoal:
     robot: str
     newest_stamp: int
     reached_last: bool
+    has_finished: bool
     place: TeamPlace | None
     is_in_hallway: bool
     remaining: float
