@@ -24,9 +24,17 @@ from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.ambiguity import NOT_DRIVEN, Ambiguity, Look
 from hmt_slam_ros.messages.map_changes import ForeignGround, ForeignKeyframe
-from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, HypothesisEstimate, Keyframe
+from hmt_slam_ros.messages.messages import (
+    ClosureDecision,
+    Hypotheses,
+    Hypothesis,
+    HypothesisEstimate,
+    Keyframe,
+    Message,
+)
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.tasks import EXPLORER_TASKS, GoalPose, Task, TaskResult, VelocityCommand, parse_task
+from hmt_slam_ros.messages.team import TeamGoal, TeamPlace
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.simulation.building import Building, FloorPlan
@@ -77,11 +85,11 @@ def with_keyframes(poses: dict[int, tuple[float, float, float]]) -> HybridMap:
 class _Explored:
     """The floor after a robot explored it."""
 
-    def __init__(self, *, explore: bool = True, changes: Mapping[str, bool] | None = None) -> None:
+    def __init__(self, *, explore: bool = True, changes: Mapping[str, bool] | None = None, robot: str = "") -> None:
         scenario = Scenario(small_floor(), Settings(seed=5, laps=1, field_of_view=360.0, beams=720))
         self.robot = DrivenRobot(scenario)
         configuration = with_changes(Configuration(), changes or {})
-        self.run = DrivenRun(self.robot, configuration, Explorer(configuration))
+        self.run = DrivenRun(self.robot, configuration, Explorer(configuration, robot=robot))
         self.outcome = self.run.run_task(Task("explore"), 400.0) if explore else None
         self.length = len(path_of(self))
 
@@ -121,12 +129,62 @@ def test_ground_of_another_robot_is_known_and_what_is_nearer_to_it_is_left_to_it
     known = explorer.exploration_map
     # To the end of the arm, where another robot has been; that is in the door of the left room now.
     assert target_in_building(explorer) == pytest.approx((6.0, 8.0), abs=1.0)
-    share_ground(own, [(6.0, 2.0, 1.6), (6.0, 5.0, 1.6), (6.0, 8.0, 1.6), (6.0, 5.0, -1.6), (3.0, -1.0, -1.6)])
+    share_ground(own, PLACES_OF_BOB)
     own.run.run_task(Task("explore"), 2.0)
     assert known.teammates.positions(known.roadmap.graph) == {"bob": -6} and not known.teammates.new_keyframes
     # Not the left room: the eastern half.
     x, y = target_in_building(explorer)
     assert x > 7.0 and y < 1.0
+
+
+PLACES_OF_BOB = [(6.0, 2.0, 1.6), (6.0, 5.0, 1.6), (6.0, 8.0, 1.6), (6.0, 5.0, -1.6), (3.0, -1.0, -1.6)]
+"""Where another robot has been: in the arm, and in the door of the left room."""
+
+
+@pytest.mark.parametrize("has_finished", [False, True])
+def test_goals_of_other_robots_are_left_to_them_and_nothing_is_left_of_one_that_has_finished(
+    *, has_finished: bool
+) -> None:
+    own = _Explored(explore=False, robot="ann")
+    own.run.run_task(Task("explore"), 16.0)
+    explorer, scans = own.run.driver, own.run.drive(Task("explore"), 100.0)
+    share_ground(own, PLACES_OF_BOB)
+    for _ in range(10):
+        next(scans)
+    hallway = target_in_building(explorer)
+    assert hallway[0] > 7.0
+    # Cid drives there, which is known by the first keyframe of Bob.
+    place = se2.between(np.array(PLACES_OF_BOB[0]), np.array([*hallway, 0.0]))
+    explorer.handle(TeamGoal("cid", 0, False, False, TeamPlace("bob", 0, place), True, 1.0))
+    explorer.handle(TeamGoal("bob", 4, False, has_finished, None, False, 0.0))
+    for _ in range(10):
+        next(scans)
+    if has_finished:
+        assert explorer._frontiers.target is None
+    else:
+        assert target_in_building(explorer) == pytest.approx((3.0, -4.8), abs=0.5)
+
+
+def test_an_explorer_sends_its_goal_when_it_is_another_one_and_every_ten_seconds() -> None:
+    own = _Explored(explore=False, robot="ann")
+    explorer, sent = own.run.driver, list[tuple[int, TeamGoal]]()
+    handle = explorer.handle
+
+    def note(message: Message) -> list[Message]:
+        outputs = handle(message)
+        sent.extend((own.robot.stamp, each) for each in outputs if isinstance(each, TeamGoal))
+        return outputs
+
+    explorer.handle = note  # type: ignore[method-assign]
+    own.run.run_task(Task("explore"), 40.0)
+    own.run.run_task(Task("stop"), 3.0)
+    goals = [goal for _, goal in sent]
+    stamps = {scan.stamp for scan in explorer.exploration_map.replica.scans.values()}
+    assert all(goal.robot == "ann" and goal.newest_stamp in stamps for goal in goals)
+    assert [goal.place is None for goal in goals] == [False] * (len(goals) - 1) + [True]
+    assert any(goal.reached_last for goal in goals)
+    gaps = np.diff([stamp for stamp, _ in sent]) / NANOSECONDS
+    assert len(gaps) > 3 and gaps.max() < 10.5
 
 
 def test_ground_that_changes_no_choice_keeps_the_route_and_the_time_since_the_last_progress() -> None:
@@ -161,7 +219,10 @@ def test_an_exploration_ends_where_only_a_room_is_left_to_another_robot() -> Non
 def share_ground(own: _Explored, places: list[tuple[float, float, float]]) -> None:
     """Send an explorer ground of another robot, with a keyframe at each place of the floor."""
     known = own.run.driver.exploration_map
-    keyframes = [ForeignKeyframe(-2 - n, 0, np.array(place) - ORIGIN, scan_at(place)) for n, place in enumerate(places)]
+    keyframes = [
+        ForeignKeyframe(-2 - n, 0, np.array(place) - ORIGIN, replace(scan_at(place), stamp=n))
+        for n, place in enumerate(places)
+    ]
     ground, best = ForeignGround("bob", tuple(keyframes)), known.replica.best_hypothesis
     own.run.driver.handle(ClosureDecision(known.event, best, (), (), foreign_ground=ground))
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hmt_slam_ros.exploration.team_goals import Claim, GoalsOfRobot, unclaimed_frontiers
+from hmt_slam_ros.exploration.team_goals import GoalsOfRobot, RobotTarget, free_frontiers
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.team import TeamGoal, TeamPlace
 
@@ -12,23 +12,23 @@ PLACES = {0: (False, np.array([0.0, 0.0])), 1: (False, np.array([4.0, 0.0])), 2:
 
 
 @pytest.mark.parametrize(
-    ("claims", "left"),
+    ("targets", "left"),
     [
         ([], [0, 1, 2]),
         # Who goes to one frontier in a room sees the others of the room.
-        ([Claim("bob", PLACES[0], 9.0)], [2]),
-        ([Claim("bob", (False, np.array([-2.0, 0.0])), 9.0)], [1, 2]),
-        ([Claim("bob", PLACES[2], 9.0)], [0, 1]),
+        ([RobotTarget("bob", PLACES[0], 9.0)], [2]),
+        ([RobotTarget("bob", (False, np.array([-2.0, 0.0])), 9.0)], [1, 2]),
+        ([RobotTarget("bob", PLACES[2], 9.0)], [0, 1]),
         # What one robot takes to be in a hallway, and the other one in a room, is one frontier all the same.
-        ([Claim("bob", (True, np.array([0.5, 0.0])), 9.0)], [1]),
-        ([Claim("bob", PLACES[0], 9.0), Claim("dan", PLACES[2], 9.0)], []),
+        ([RobotTarget("bob", (True, np.array([0.5, 0.0])), 9.0)], [1]),
+        ([RobotTarget("bob", PLACES[0], 9.0), RobotTarget("dan", PLACES[2], 9.0)], []),
         # A robot that is nearer by more than 5 m goes there.
-        ([Claim("bob", PLACES[0], 11.0)], [0, 1, 2]),
+        ([RobotTarget("bob", PLACES[0], 11.0)], [0, 1, 2]),
     ],
 )
-def test_goals_of_others_are_left_to_them(claims, left):
+def test_goals_of_others_are_left_to_them(targets, left):
     own = {0: (ROOM, 5.5), 1: (ROOM, 7.0), 2: (HALLWAY, 5.0)}
-    assert list(unclaimed_frontiers(own, PLACES, claims)) == left
+    assert list(free_frontiers(own, PLACES, targets)) == left
 
 
 def test_of_two_robots_with_one_goal_the_nearer_one_goes_on():
@@ -39,8 +39,11 @@ def test_of_two_robots_with_one_goal_the_nearer_one_goes_on():
         goes_on = []
         for robot, other in (("ann", "bob"), ("bob", "ann")):
             own = {0: (ROOM, float(random.uniform(0.0, 10.0)))}
-            claims, own_claim = [Claim(other, PLACES[1], sent[other])], Claim(robot, PLACES[0], sent[robot])
-            goes_on += [robot for _ in unclaimed_frontiers(own, PLACES, claims, own_claim)]
+            targets, own_target = (
+                [RobotTarget(other, PLACES[1], sent[other])],
+                RobotTarget(robot, PLACES[0], sent[robot]),
+            )
+            goes_on += [robot for _ in free_frontiers(own, PLACES, targets, own_target)]
         assert goes_on == [min(sent, key=lambda name: (sent[name], name))]
 
 
@@ -66,22 +69,22 @@ def test_a_goal_counts_while_it_is_sent_again():
     assert goals.last(1000 * NANOSECONDS).place is None
 
 
-def left(goals, now=0):
+def earlier_stamps(goals, now=0):
     """The stamps of goals that were left, negative where the robot did not reach them."""
-    return [each.place.stamp if was_reached else -each.place.stamp for each, was_reached in goals.left(now)]
+    return [each.place.stamp if was_reached else -each.place.stamp for each, was_reached in goals.earlier(now)]
 
 
 def test_a_goal_that_was_left_counts_until_the_ground_from_there_has_arrived():
     goals = goals_of(goal(3), goal(3), goal(5, newest_stamp=7, reached_last=True), goal(newest_stamp=9))
-    assert left(goals) == [3, -5]
+    assert earlier_stamps(goals) == [3, -5]
     assert [place.stamp for place in goals.reached] == [3]
     goals.add_ground(7)
-    assert left(goals) == [-5]
-    assert left(goals, 61 * NANOSECONDS) == []
+    assert earlier_stamps(goals) == [-5]
+    assert earlier_stamps(goals, 61 * NANOSECONDS) == []
     goals.add_ground(9)
-    assert left(goals) == []
+    assert earlier_stamps(goals) == []
 
 
 def test_the_number_of_goals_that_were_left_is_bounded():
     goals = goals_of(*(goal(n, newest_stamp=n, reached_last=True) for n in range(1, 100)))
-    assert left(goals) == list(range(91, 99))
+    assert earlier_stamps(goals) == list(range(91, 99))

@@ -11,7 +11,7 @@ from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.exploration.path_follower import KeyframeLocator, Route
 from hmt_slam_ros.exploration.pose_goals import anchor_pose
-from hmt_slam_ros.exploration.roadmap import EntryPoint, Roadmap
+from hmt_slam_ros.exploration.roadmap import EntryPoint, Frontier, Roadmap
 from hmt_slam_ros.exploration.teammates import Teammates
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -166,6 +166,10 @@ class ExplorationMap:
             return False
         one, other = (locator.keyframe_pose(each) for each in (keyframe, self._updated_at))
         return math.dist(one[:2], other[:2]) <= _TEAMMATE_STEP
+
+    def frontier_position(self, frontier: Frontier) -> Float64:
+        """Where a frontier is, in the frame of the robot's area, shape (2,), m."""
+        return se2.transform(self.keyframe_locator.keyframe_pose(frontier.keyframe), frontier.path[-1])
 
     def route_in_base(self, route: Route) -> Float64:
         """The points of a route (n, 2) in the frame of the base now, m."""

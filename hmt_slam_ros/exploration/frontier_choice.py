@@ -13,14 +13,9 @@ from typing import NamedTuple
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.exploration.exploration_map import ExplorationMap
+from hmt_slam_ros.exploration.goal_sender import Goal, GoalSender
 from hmt_slam_ros.exploration.roadmap import SAME_FRONTIER_DISTANCE, Frontier
-from hmt_slam_ros.exploration.team_goals import (
-    GOAL_PERIOD,
-    Claim,
-    Cost,
-    are_seen_together,
-    unclaimed_frontiers,
-)
+from hmt_slam_ros.exploration.team_goals import Cost, FrontierPlace, RobotTarget, are_seen_together, free_frontiers
 from hmt_slam_ros.exploration.teammates import choose_frontier, group_frontiers
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.messages import Message
@@ -55,13 +50,10 @@ class FrontierChoice:
         self._reached: list[tuple[int, Float64]] = []
         self._abandoned: list[tuple[int, Float64]] = []
         self._may_retry = True
-        # The goal as it was sent last, when, and how far it was then.
-        self._sent: Frontier | None = None
-        self._sent_at, self._sent_length, self._path_length = 0, 0.0, 0.0
-        self._has_finished = self._sent_finished = False
+        self._path_length, self._has_finished = 0.0, False
+        self._sender = GoalSender(exploration_map)
         # Robots whose explorations have ended.
         self._finished = set[str]()
-        self._reached_it = False
 
     @property
     def abandoned_count(self) -> int:
@@ -81,7 +73,7 @@ class FrontierChoice:
         assert self.target is not None
         (self._reached if reached else self._abandoned).append((self.target.keyframe, self.target.path[-1]))
         self._may_retry |= reached
-        self._reached_it = reached
+        self._sender.reached_last = reached
 
     def retry(self) -> bool:
         """Whether frontiers that were given up, maybe because of people, are tried again: if any was reached since."""
@@ -102,17 +94,20 @@ class FrontierChoice:
         self._finished = {name for name, goals in team.goals.items() if goals.has_finished}
         left = [n for n, each in enumerate(roadmap.frontiers) if not (self._was_tried(each) or self._is_finished(each))]
         costs = self._costs(here, left)
-        places = {n: (not is_in_room, self._position(roadmap.frontiers[n])) for n, (is_in_room, _) in costs.items()}
+        places = {
+            n: (not is_in_room, self._map.frontier_position(roadmap.frontiers[n]))
+            for n, (is_in_room, _) in costs.items()
+        }
         groups = group_frontiers(places)
-        claims, others = self._others()
-        free = unclaimed_frontiers(costs, places, claims, self._own_claim)
+        targets, others = self._others()
+        free = free_frontiers(costs, places, targets, self._sender.sent_target)
         costs_of_others = {name: self._costs(keyframe, free) for name, keyframe in others.items()}
         number = choose_frontier(free, costs_of_others, groups, team.robot)
         if number is None:
             self.target = None
             rooms = {groups[n] for n, (is_in_room, _) in costs.items() if is_in_room}
             return Choice(
-                left_to=tuple(sorted({*others, *(claim.robot for claim in claims)})),
+                left_to=tuple(sorted({*others, *(target.robot for target in targets)})),
                 is_over=rooms.issuperset(groups.values()),
             )
         if is_on_way and self._is_target(places[number][1]):
@@ -137,23 +132,7 @@ class FrontierChoice:
         :param stamp: now, ns.
         :param remaining: length of the path to the target, m, None where it is not known.
         """
-        team, scans = self._map.teammates, self._map.replica.scans
-        is_due = self.target is not None and stamp - self._sent_at >= GOAL_PERIOD
-        is_new = self.target is not self._sent or self._has_finished != self._sent_finished
-        if not (team.robot and scans and (is_due or is_new)):
-            return []
-        if self.target is not None and self.target.keyframe not in scans:
-            return []
-        # A new path has no remaining length before the robot follows it.
-        length = self._path_length if remaining is None or self.target is not self._sent else remaining
-        self._sent, self._sent_at, self._sent_length = self.target, stamp, length
-        self._sent_finished = self._has_finished
-        goal = TeamGoal(team.robot, scans[max(scans)].stamp, self._reached_it, self._has_finished, None, False, 0.0)
-        self._reached_it = False
-        if self.target is None:
-            return [goal]
-        place = team.place_at(self.target.keyframe, self.target.end, scans)
-        return [replace(goal, place=place, is_in_hallway=self.target.is_in_hallway, remaining=length)]
+        return self._sender.send(Goal(self.target, self._path_length, self._has_finished), stamp, remaining)
 
     def _costs(self, start: int, numbers: Iterable[int]) -> dict[int, Cost]:
         """{number: cost from a keyframe on} of those frontiers that can be reached."""
@@ -166,36 +145,28 @@ class FrontierChoice:
             if frontier.keyframe in distances
         }
 
-    def _others(self) -> tuple[list[Claim], dict[str, int]]:
-        """What others claim, and {robot: its newest keyframe} of those of which it is not known where they drive to."""
+    def _others(self) -> tuple[list[RobotTarget], dict[str, int]]:
+        """The targets of others, and {robot: its newest keyframe} of those whose targets are not known."""
         team = self._map.teammates
-        claims, others = list[Claim](), team.positions(self._map.roadmap.graph)
+        targets, others = list[RobotTarget](), team.positions(self._map.roadmap.graph)
         for name, goals in team.goals.items():
-            left = goals.left(team.stamp)
-            claims += self._claims_of(replace(goal, remaining=0.0) for goal, was_reached in left if was_reached)
+            earlier = goals.earlier(team.stamp)
+            targets += self._targets_of(replace(goal, remaining=0.0) for goal, was_reached in earlier if was_reached)
             last = goals.last(team.stamp)
             if last is None:
                 continue
             # A goal in ground that is still to come is where the robot drove to before, or behind that.
-            known = self._claims_of([last, *(replace(goal, remaining=last.remaining) for goal, _ in left[::-1])])
-            claims += known[:1] if last.place is not None else []
+            known = self._targets_of([last, *(replace(goal, remaining=last.remaining) for goal, _ in earlier[::-1])])
+            targets += known[:1] if last.place is not None else []
             if last.place is None or known:
                 others.pop(name, None)
-        return claims, others
+        return targets, others
 
-    @property
-    def _own_claim(self) -> Claim | None:
-        """The robot's own claim, as it was sent."""
-        if self._sent is None or self._sent.keyframe not in self._map.keyframe_locator:
-            return None
-        place = self._sent.is_in_hallway, self._position(self._sent)
-        return Claim(self._map.teammates.robot, place, self._sent_length)
-
-    def _claims_of(self, goals: Iterable[TeamGoal]) -> list[Claim]:
-        """What goals claim, without those that are nowhere, or beside a keyframe that is not in the map."""
+    def _targets_of(self, goals: Iterable[TeamGoal]) -> list[RobotTarget]:
+        """The frontiers of goals, without those that are nowhere, or beside a keyframe that is not in the map."""
         points = [(goal, None if goal.place is None else self._point_of(goal.place)) for goal in goals]
         return [
-            Claim(goal.robot, (goal.is_in_hallway, point), goal.remaining)
+            RobotTarget(goal.robot, (goal.is_in_hallway, point), goal.remaining)
             for goal, point in points
             if point is not None
         ]
@@ -211,16 +182,11 @@ class FrontierChoice:
     def _is_target(self, position: Float64) -> bool:
         """Whether the target is at a position."""
         assert self.target is not None
-        return math.dist(position, self._position(self.target)) < SAME_FRONTIER_DISTANCE
-
-    def _position(self, frontier: Frontier) -> Float64:
-        """Where a frontier is, in the frame of the robot's area, shape (2,)."""
-        pose = self._map.keyframe_locator.keyframe_pose(frontier.keyframe)
-        return se2.transform(pose, frontier.path[-1])
+        return math.dist(position, self._map.frontier_position(self.target)) < SAME_FRONTIER_DISTANCE
 
     def _was_tried(self, frontier: Frontier) -> bool:
         """Whether a frontier was reached or given up."""
-        locator, position = self._map.keyframe_locator, self._position(frontier)
+        locator, position = self._map.keyframe_locator, self._map.frontier_position(frontier)
         return any(
             math.dist(position, se2.transform(locator.keyframe_pose(keyframe), point)) < SAME_FRONTIER_DISTANCE
             for keyframe, point in self._reached + self._abandoned
@@ -235,5 +201,8 @@ class FrontierChoice:
         owner = self._map.teammates.owner_of(frontier.keyframe)
         if owner not in self._finished:
             return False
-        claim, place = self._own_claim, (frontier.is_in_hallway, self._position(frontier))
-        return claim is None or not are_seen_together(claim.place, place)
+        target = self._sender.sent_target
+        return target is None or not are_seen_together(target.place, self._place(frontier))
+
+    def _place(self, frontier: Frontier) -> FrontierPlace:
+        return frontier.is_in_hallway, self._map.frontier_position(frontier)

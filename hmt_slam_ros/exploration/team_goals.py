@@ -36,7 +36,7 @@ _MAX_REACHED = 64
 """Most goals that a robot reached and that wait for its ground."""
 
 
-class _LeftGoal(NamedTuple):
+class _EarlierGoal(NamedTuple):
     """A goal that a robot reached, or left for another one.
 
     :ivar goal: as it was sent.
@@ -61,7 +61,7 @@ class GoalsOfRobot:
         self.reached: deque[TeamPlace] = deque(maxlen=_MAX_REACHED)
         self._last: TeamGoal | None = None
         self._arrived = 0
-        self._left: deque[_LeftGoal] = deque(maxlen=_MAX_LEFT)
+        self._earlier: deque[_EarlierGoal] = deque(maxlen=_MAX_LEFT)
 
     def add(self, goal: TeamGoal, now: int) -> None:
         """Note the next goal.
@@ -70,13 +70,13 @@ class GoalsOfRobot:
         """
         last = self._last
         if last is not None and last.place is not None and not _are_same(last.place, goal.place):
-            self._left.append(_LeftGoal(last, goal.reached_last, goal.newest_stamp, now))
+            self._earlier.append(_EarlierGoal(last, goal.reached_last, goal.newest_stamp, now))
             self.reached += [last.place] if goal.reached_last else []
         self._last, self._arrived = goal, now
 
     def add_ground(self, newest_stamp: int) -> None:
         """Note that the map has the robot's ground up to a keyframe of that stamp, on the robot's clock, ns."""
-        self._left = deque((each for each in self._left if each.newest_stamp > newest_stamp), maxlen=_MAX_LEFT)
+        self._earlier = deque((each for each in self._earlier if each.newest_stamp > newest_stamp), maxlen=_MAX_LEFT)
 
     @property
     def has_finished(self) -> bool:
@@ -88,9 +88,9 @@ class GoalsOfRobot:
         is_sent = self._last is not None and (self._last.place is None or now - self._arrived <= _GOAL_TIMEOUT)
         return self._last if is_sent else None
 
-    def left(self, now: int) -> list[tuple[TeamGoal, bool]]:
+    def earlier(self, now: int) -> list[tuple[TeamGoal, bool]]:
         """The goals that it left, and whether it reached each, where the map does not show yet what is there."""
-        return [(each.goal, each.was_reached) for each in self._left if now - each.arrived <= _LEFT_TIMEOUT]
+        return [(each.goal, each.was_reached) for each in self._earlier if now - each.arrived <= _LEFT_TIMEOUT]
 
 
 def _are_same(one: TeamPlace, other: TeamPlace | None) -> bool:
@@ -98,7 +98,7 @@ def _are_same(one: TeamPlace, other: TeamPlace | None) -> bool:
     return is_beside_it and other is not None and np.array_equal(one.pose, other.pose)
 
 
-class Claim(NamedTuple):
+class RobotTarget(NamedTuple):
     """A frontier that is a robot's.
 
     :ivar robot: name of the robot.
@@ -111,11 +111,11 @@ class Claim(NamedTuple):
     remaining: float
 
 
-def unclaimed_frontiers(
+def free_frontiers(
     own: Mapping[int, Cost],
     places: Mapping[int, FrontierPlace],
-    claims: Iterable[Claim],
-    own_claim: Claim | None = None,
+    targets: Iterable[RobotTarget],
+    own_target: RobotTarget | None = None,
 ) -> dict[int, Cost]:
     """{frontier: its cost for this robot} of those that no other robot sees from where it drives to.
 
@@ -124,16 +124,16 @@ def unclaimed_frontiers(
 
     :param own: {frontier: cost} of all.
     :param places: {frontier: its place}.
-    :param claims: of other robots.
-    :param own_claim: as this robot has sent it.
+    :param targets: of other robots.
+    :param own_target: as this robot has sent it.
     """
     taken = set[int]()
-    for claim in claims:
-        near = {number for number in own if are_seen_together(places[number], claim.place)}
-        if own_claim is not None and are_seen_together(own_claim.place, claim.place):
-            is_own = (own_claim.remaining, own_claim.robot) < (claim.remaining, claim.robot)
+    for target in targets:
+        near = {number for number in own if are_seen_together(places[number], target.place)}
+        if own_target is not None and are_seen_together(own_target.place, target.place):
+            is_own = (own_target.remaining, own_target.robot) < (target.remaining, target.robot)
         else:
-            is_own = any(own[number][1] + 2.0 * LAG < claim.remaining for number in near)
+            is_own = any(own[number][1] + 2.0 * LAG < target.remaining for number in near)
         taken |= set() if is_own else near
     return {frontier: cost for frontier, cost in own.items() if frontier not in taken}
 
