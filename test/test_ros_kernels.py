@@ -56,6 +56,11 @@ class Drive:
         robot.communicate(timeout=20)
         return [len(decode(message.data, ClosureDecision).arcs) for message in self._decisions]
 
+    @property
+    def landmark_kinds(self):
+        """Of the last message, which comes every three seconds at most."""
+        return {marker.ns for message in self.landmarks[-1:] for marker in message.markers}
+
     def _has_ended(self):
         states = self._robot_states
         return states and decode(states[-1].data, RobotStatus).state == "ended"
@@ -67,11 +72,11 @@ def test_no_kernel_is_loaded_amid_a_drive_with_a_loop_closure_and_a_relocalizati
     assert listener.call(Trigger, "slam/relocalize", Trigger.Request()).success
     drive.run(15.0)
     listener.until(lambda: (False, True) in pairwise(message.data for message in drive.localized))
+    listener.until(lambda: drive.landmark_kinds & {"corners", "convex_corners", "openings"})
     count = len(drive.reported)
     listener.until(lambda: all(kernel_entries(drive.reported[count:], name) for name in process_names()))
     last = {name: kernel_entries(drive.reported, name)[-1] for name in process_names()}
     assert all(entry.endswith(" loaded") for entry in last.values()), last
-    assert {marker.ns for marker in drive.landmarks[-1].markers} & {"corners", "convex_corners", "openings"}
     assert [name for name, entry in last.items() if entry == "0 loaded"] == ["rtl"]
 
 

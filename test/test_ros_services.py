@@ -33,7 +33,7 @@ NAMED = {value for name, value in vars(topics).items() if name.isupper() and isi
 MESSAGES = Path(__file__).parent.parent / "docs" / "reference" / "messages.md"
 SAID = {f"/{topic.lstrip('/')}" for topic in {*NAMED, *topics.DOCUMENTS.values(), *TRANSFORMS}} - {
     *("/team/statuses", "/team/requests", "/team/updates", "/team/placements", "/hmt/joined_ground"),  # of a team
-    "/team/rendezvous",  # likewise
+    *("/team/rendezvous", "/team/goals"),  # likewise
     *("/initialpose", "/cmd_vel", "/rendezvous", "/statement"),  # which are subscribed to
     "/ground_truth",  # of a robot that is driven
     "/hmt/incidents",  # of the page

@@ -113,6 +113,17 @@ def test_the_robots_own_area_is_shared_in_steps():
     assert_same(foreign, robot, [0])
 
 
+def test_all_of_the_own_area_is_shared_where_the_robot_stands():
+    robot, foreign = Robot(), ForeignMap(ForeignMapState("a"))
+    robot.map_keyframes(0, NEW_KEYFRAMES)
+    assert not robot.map_keyframes(0, 2)
+    replica = Replica(robot.scans, {0: robot.map}, {0: 1.0}, {0: 0})
+    assert robot.shared.take_over(replica, is_standing=True)
+    assert not robot.shared.take_over(replica, is_standing=True)
+    receive(foreign, robot)
+    assert_same(foreign, robot, [0])
+
+
 def test_what_is_not_committed_yet_is_shared_in_steps():
     """Keyframes become definite with the next accepted hypothesis, which may take a whole area."""
     robot, foreign = Robot(), ForeignMap(ForeignMapState("a"))
