@@ -85,6 +85,15 @@ def test_a_goal_that_was_left_counts_until_the_ground_from_there_has_arrived():
     assert earlier_stamps(goals) == []
 
 
+def test_ground_may_come_before_the_goal():
+    goals = goals_of(goal(3))
+    goals.add_ground(9)
+    goals.add(goal(5, newest_stamp=9, reached_last=True), 0)
+    assert earlier_stamps(goals) == []
+    goals.add(goal(6, newest_stamp=10, reached_last=True), 0)
+    assert earlier_stamps(goals) == [5]
+
+
 def test_the_number_of_goals_that_were_left_is_bounded():
     goals = goals_of(*(goal(n, newest_stamp=n, reached_last=True) for n in range(1, 100)))
     assert earlier_stamps(goals) == list(range(91, 99))

@@ -135,9 +135,10 @@ def test_robots_know_a_place_by_the_stamp_of_a_scan():
     ann.add(ForeignGround("bob", (ForeignKeyframe(-2, 3, np.zeros(3), scans[2]),)))
     bob.add(ForeignGround("ann", (ForeignKeyframe(-7, 3, np.zeros(3), scans[1]),)))
     of_ann, of_bob = {0: scans[0], 1: scans[1], -2: scans[2]}, {0: scans[1], 4: scans[2], -7: scans[1]}
+    in_bob = bob.keyframes_by_scan(of_bob)
     for keyframe, same in ((1, -7), (-2, 4), (0, None)):
-        assert bob.keyframe_of(ann.place_at(keyframe, np.zeros(3), of_ann), of_bob) == same
+        place = ann.place_at(keyframe, np.zeros(3), of_ann)
+        assert in_bob.get((place.owner, place.stamp)) == same
     assert ann.place_at(-2, np.zeros(3), of_ann).owner == "bob"
     # Another robot's keyframe of the same stamp is another one.
-    assert bob.keyframe_of(TeamPlace("bob", 1, np.zeros(3)), of_bob) == 0
-    assert bob.keyframe_of(TeamPlace("cid", 1, np.zeros(3)), of_bob) is None
+    assert (in_bob["bob", 1], in_bob["ann", 1]) == (0, -7)

@@ -52,7 +52,8 @@ class FrontierChoice:
         self._may_retry = True
         self._path_length, self._has_finished = 0.0, False
         self._sender = GoalSender(exploration_map)
-        # Robots whose explorations have ended.
+        # {(robot, stamp of a scan): keyframe} of the map, and robots whose explorations have ended.
+        self._keyframes: dict[tuple[str, int], int] = {}
         self._finished = set[str]()
 
     @property
@@ -90,6 +91,7 @@ class FrontierChoice:
         """
         team, roadmap = self._map.teammates, self._map.roadmap
         team.has_new_goals = False
+        self._keyframes = team.keyframes_by_scan(self._map.replica.scans) if team.goals else {}
         self._take_over_reached()
         self._finished = {name for name, goals in team.goals.items() if goals.has_finished}
         left = [n for n, each in enumerate(roadmap.frontiers) if not (self._was_tried(each) or self._is_finished(each))]
@@ -117,10 +119,9 @@ class FrontierChoice:
 
     def _take_over_reached(self) -> None:
         """What other robots reached is reached for this one, too, as soon as its map has the keyframe beside it."""
-        team, scans = self._map.teammates, self._map.replica.scans
-        for goals in team.goals.values():
+        for goals in self._map.teammates.goals.values():
             for place in [goals.reached.popleft() for _ in range(len(goals.reached))]:
-                keyframe = team.keyframe_of(place, scans)
+                keyframe = self._keyframes.get((place.owner, place.stamp))
                 if keyframe is None:
                     goals.reached.append(place)
                 else:
@@ -174,7 +175,7 @@ class FrontierChoice:
     def _point_of(self, place: TeamPlace) -> Float64 | None:
         """A place in the frame of the robot's area, shape (2,); None where its keyframe is not in the map."""
         locator = self._map.keyframe_locator
-        keyframe = self._map.teammates.keyframe_of(place, self._map.replica.scans)
+        keyframe = self._keyframes.get((place.owner, place.stamp))
         if keyframe is None or keyframe not in locator:
             return None
         return se2.transform(locator.keyframe_pose(keyframe), place.pose[:2])

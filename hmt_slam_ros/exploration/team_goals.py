@@ -60,7 +60,7 @@ class GoalsOfRobot:
     def __init__(self) -> None:
         self.reached: deque[TeamPlace] = deque(maxlen=_MAX_REACHED)
         self._last: TeamGoal | None = None
-        self._arrived = 0
+        self._arrived, self._ground_stamp = 0, -1
         self._earlier: deque[_EarlierGoal] = deque(maxlen=_MAX_LEFT)
 
     def add(self, goal: TeamGoal, now: int) -> None:
@@ -76,7 +76,7 @@ class GoalsOfRobot:
 
     def add_ground(self, newest_stamp: int) -> None:
         """Note that the map has the robot's ground up to a keyframe of that stamp, on the robot's clock, ns."""
-        self._earlier = deque((each for each in self._earlier if each.newest_stamp > newest_stamp), maxlen=_MAX_LEFT)
+        self._ground_stamp = max(self._ground_stamp, newest_stamp)
 
     @property
     def has_finished(self) -> bool:
@@ -90,7 +90,11 @@ class GoalsOfRobot:
 
     def earlier(self, now: int) -> list[tuple[TeamGoal, bool]]:
         """The goals that it left, and whether it reached each, where the map does not show yet what is there."""
-        return [(each.goal, each.was_reached) for each in self._earlier if now - each.arrived <= _LEFT_TIMEOUT]
+        return [
+            (each.goal, each.was_reached)
+            for each in self._earlier
+            if each.newest_stamp > self._ground_stamp and now - each.arrived <= _LEFT_TIMEOUT
+        ]
 
 
 def _are_same(one: TeamPlace, other: TeamPlace | None) -> bool:

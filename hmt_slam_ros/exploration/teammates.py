@@ -25,21 +25,20 @@ class Teammates:
     """The robots whose ground is part of the map.
 
     :ivar robot: name of this robot in its team, empty without one.
-    :ivar new_keyframes: keyframes of others that the roadmap does not have yet, in the order in which they came.
     :ivar stamp: time of the last update, ns.
+    :ivar new_keyframes: keyframes of others that the roadmap does not have yet, in the order in which they came.
     :ivar has_new_goals: whether others have sent goals since this was set to False.
-    :ivar goals: {robot: goals} of those that have sent any.
+    :ivar goals: {robot: goals} of those that have sent any, or of which there is ground.
     """
 
     def __init__(self, robot: str = "") -> None:
-        self.robot = robot
+        self.robot, self.stamp = robot, 0
         self.new_keyframes: list[int] = []
         self.has_new_goals = False
+        self.goals: dict[str, GoalsOfRobot] = {}
         self._keyframes: dict[str, list[int]] = {}
         self._owners: dict[int, str] = {}
         self._arrived: dict[str, int] = {}
-        self.goals: dict[str, GoalsOfRobot] = {}
-        self.stamp = 0
 
     def add(self, ground: ForeignGround) -> None:
         """Note new ground of a robot."""
@@ -49,8 +48,8 @@ class Teammates:
             self._keyframes.setdefault(ground.robot, []).extend(keyframes)
             self._owners |= dict.fromkeys(keyframes, ground.robot)
             self._arrived[ground.robot] = self.stamp
-            if ground.robot in self.goals:
-                self.goals[ground.robot].add_ground(max(each.scan.stamp for each in ground.keyframes))
+            newest_stamp = max(each.scan.stamp for each in ground.keyframes)
+            self.goals.setdefault(ground.robot, GoalsOfRobot()).add_ground(newest_stamp)
 
     def add_goal(self, goal: TeamGoal) -> None:
         """Note to where a robot drives; a team has one robot of a name."""
@@ -75,14 +74,12 @@ class Teammates:
         """The robot that mapped a keyframe."""
         return self._owners.get(keyframe, self.robot)
 
-    def keyframe_of(self, place: TeamPlace, scans: Mapping[int, Scan]) -> int | None:
-        """The keyframe of a place, None where it is not in the map.
+    def keyframes_by_scan(self, scans: Mapping[int, Scan]) -> dict[tuple[str, int], int]:
+        """{(robot that mapped it, stamp of its scan): keyframe}, as places name keyframes.
 
         :param scans: {keyframe: scan} of the map.
         """
-        own = (keyframe for keyframe in scans if keyframe >= 0)
-        keyframes = own if place.owner == self.robot else self._keyframes.get(place.owner, ())
-        return next((k for k in keyframes if k in scans and scans[k].stamp == place.stamp), None)
+        return {(self.owner_of(keyframe), scan.stamp): keyframe for keyframe, scan in scans.items()}
 
     def positions(self, roadmap: Container[int]) -> dict[str, int]:
         """{robot: its newest keyframe in a roadmap} of those that explore, and have one."""
