@@ -17,6 +17,7 @@ from benchmark.recorded_chain import ChainPublisher, record_chain
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.documents import decode, encode
+from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.team import (
     SharedArea,
     TeamPlacement,
@@ -105,6 +106,11 @@ def team(listener, start):
         def messages(self, kind):
             return [decode(message.data, kind) for message in self.sent[kind]]
 
+        def shared_scans(self, robot):
+            """The keyframes that a robot has shared."""
+            updates = [each for each in self.messages(TeamUpdate) if each.robot == robot.name]
+            return {item.keyframe for update in updates for item in update.scans}
+
         def answers(self):
             """{(robot, first, second): the last answer}."""
             return {(each.robot, each.first, each.second): each for each in self.messages(TeamPlacement)}
@@ -121,6 +127,14 @@ def team(listener, start):
             return answer is not None and answer.probability > 0.99
 
     return Team()
+
+
+def mapped_scans(messages):
+    """The keyframes in the map of a chain."""
+    replica = Replica()
+    for message in messages:
+        replica.apply_message(message)
+    return replica.scans.keys()
 
 
 def is_near(pose, expected):
@@ -145,6 +159,9 @@ def test_robots_of_one_building_find_one_another_and_a_third_stays_apart(team, t
     assert {each.verdict for key, each in team.answers().items() if "cid" in key} <= {Verdict.APART, Verdict.OPEN}
     assert not cid.transforms
     team.until(lambda: ann.values["joined with"] == "bob" and cid.values["joined with"] == "none")
+    # They stand now, so that all of the areas is shared in which they are.
+    for robot, messages in chains.items():
+        team.until(lambda robot=robot, messages=messages: team.shared_scans(robot) >= mapped_scans(messages))
     # What a robot shares is sent once, though two others want it; again only to one that requested it again, as lost.
     requests = Counter((each.robot, each.owner, each.after) for each in team.messages(TeamRequest))
     repeated = {(owner, after): count for (_, owner, after), count in requests.items() if count > 1}
