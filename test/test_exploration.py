@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 
@@ -15,6 +15,7 @@ from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import Explorer
+from hmt_slam_ros.exploration.frontier_choice import Choice
 from hmt_slam_ros.exploration.laser_views import LaserViews, ObstacleView
 from hmt_slam_ros.exploration.local_motion import MotionCommand, MotionLimits, command_towards
 from hmt_slam_ros.exploration.look_planner import LookPlanner
@@ -161,8 +162,23 @@ def test_goals_of_other_robots_are_left_to_them_and_nothing_is_left_of_one_that_
         next(scans)
     if has_finished:
         assert explorer._frontiers.target is None
+        assert_it_looks_for_a_goal_once_a_second(explorer, scans)
     else:
         assert target_in_building(explorer) == pytest.approx((3.0, -4.8), abs=0.5)
+
+
+def assert_it_looks_for_a_goal_once_a_second(explorer: Explorer, scans: Iterator[object]) -> None:
+    """Each time it updates its roadmap, which takes longer than all else that a scan causes."""
+    choose, chosen = explorer._frontiers.choose, list[int]()
+
+    def count(here: int, *, is_on_way: bool) -> Choice:
+        chosen.append(here)
+        return choose(here, is_on_way=is_on_way)
+
+    explorer._frontiers.choose = count  # type: ignore[method-assign]
+    for _ in range(20):
+        next(scans)
+    assert 3 <= len(chosen) <= 6
 
 
 def test_an_explorer_sends_its_goal_when_it_is_another_one_and_every_ten_seconds() -> None:

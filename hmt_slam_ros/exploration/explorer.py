@@ -56,6 +56,9 @@ _RESELECT_DISTANCE = 3.0
 _TRIES = 3
 """Routes to a place before a task is given up."""
 
+_CHOICE_PERIOD, _NEVER = NANOSECONDS, -NANOSECONDS
+"""Least time between two choices of a robot that found no goal in a map that stays as it is; before the first, ns."""
+
 _STAND = (0.0, 0.0)
 
 
@@ -80,7 +83,7 @@ class Explorer:
         self._frontiers = FrontierChoice(self.exploration_map)
         self.task: Task | None = None
         self._goal: AnchoredPose | None = None
-        self._tries = 0
+        self._tries, self._chosen_at = 0, _NEVER
         self._route: Route | None = None
         self._path_follower = PathFollower(self._limits, _PLACE_TOLERANCE)
         self._velocity, self._views = _STAND, LaserViews()
@@ -94,7 +97,7 @@ class Explorer:
         if isinstance(message, Task):
             self.task = None if message.kind == "stop" else message
             self._goal = message.goal
-            self._route, self._tries = None, 0
+            self._route, self._tries, self._chosen_at = None, 0, _NEVER
             self._frontiers.forget_target()
             self._look_planner.forget_tries()
         elif isinstance(message, Scan):
@@ -129,8 +132,10 @@ class Explorer:
         self._look_planner.update(self.exploration_map.event)
         if ready and self.task is not None:
             if self.exploration_map.has_changed and not self._keeps_route():
-                self._route = None
-            if self._route is None or self._has_news_of_others:
+                self._route, self._chosen_at = None, _NEVER
+            is_due = not 0 <= scan.stamp - self._chosen_at < _CHOICE_PERIOD
+            if self._has_news_of_others or (self._route is None and is_due):
+                self._chosen_at = scan.stamp
                 outputs += self._choose_goal(self.task, scan.stamp)
         self._velocity = self._follow_route(view, outputs) if ready and self._route is not None else _STAND
         outputs += self._frontiers.share(scan.stamp, self.progress.remaining)
