@@ -232,6 +232,18 @@ def test_an_exploration_ends_where_only_a_room_is_left_to_another_robot() -> Non
     assert len(explorer.named_rooms()) == 1
 
 
+def test_an_exploration_names_no_other_robot_where_nothing_is_left() -> None:
+    own = _Explored(explore=False)
+    own.run.run_task(Task("explore"), 16.0)
+    share_ground(own, PLACES_OF_BOB)
+    own.run.run_task(Task("explore"), 2.0)
+    known, choice = own.run.driver.exploration_map, own.run.driver._frontiers
+    here = known.update_roadmap()
+    assert here is not None
+    choice._reached += [(frontier.keyframe, frontier.path[-1]) for frontier in known.roadmap.frontiers]
+    assert choice.choose(here.keyframe, is_on_way=False) == Choice(is_over=True)
+
+
 def share_ground(own: _Explored, places: list[tuple[float, float, float]]) -> None:
     """Send an explorer ground of another robot, with a keyframe at each place of the floor."""
     known = own.run.driver.exploration_map

@@ -96,6 +96,9 @@ class FrontierChoice:
         self._finished = {name for name, goals in team.goals.items() if goals.has_finished}
         left = [n for n, each in enumerate(roadmap.frontiers) if not (self._was_tried(each) or self._is_finished(each))]
         costs = self._costs(here, left)
+        if not costs:
+            self.target = None
+            return Choice(is_over=True)
         places = {
             n: (not is_in_room, self._map.frontier_position(roadmap.frontiers[n]))
             for n, (is_in_room, _) in costs.items()
