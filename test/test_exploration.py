@@ -2,115 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
+from explored_floor import LASER, ROOMS, Explored, completed_task, explore, path_of, scan_at, small_floor, view_of
 
 from benchmark.driven_run import DrivenRun, true_place
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
-from hmt_slam_ros.configuration.flat import with_changes
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.exploration.explorer import Explorer
-from hmt_slam_ros.exploration.frontier_choice import Choice
-from hmt_slam_ros.exploration.laser_views import LaserViews, ObstacleView
+from hmt_slam_ros.exploration.laser_views import ObstacleView
 from hmt_slam_ros.exploration.local_motion import MotionCommand, MotionLimits, command_towards
 from hmt_slam_ros.exploration.look_planner import LookPlanner
 from hmt_slam_ros.exploration.path_follower import PathFollower
 from hmt_slam_ros.geometry import se2
-from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 from hmt_slam_ros.messages.ambiguity import NOT_DRIVEN, Ambiguity, Look
-from hmt_slam_ros.messages.map_changes import ForeignGround, ForeignKeyframe
 from hmt_slam_ros.messages.messages import (
     ClosureDecision,
     Hypotheses,
     Hypothesis,
     HypothesisEstimate,
     Keyframe,
-    Message,
 )
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.messages.tasks import EXPLORER_TASKS, GoalPose, Task, TaskResult, VelocityCommand, parse_task
-from hmt_slam_ros.messages.team import TeamGoal, TeamPlace
+from hmt_slam_ros.messages.tasks import EXPLORER_TASKS, GoalPose, Task, VelocityCommand, parse_task
 from hmt_slam_ros.registration.consistency import Clutter
 from hmt_slam_ros.sensors import Scan
-from hmt_slam_ros.simulation.building import Building, FloorPlan
 from hmt_slam_ros.simulation.driven_robot import DrivenRobot
 from hmt_slam_ros.simulation.laser import Laser, wall_index
-from hmt_slam_ros.simulation.scenario import START, Scenario
+from hmt_slam_ros.simulation.scenario import Scenario
 from hmt_slam_ros.simulation.settings import Settings
-
-ROOMS = np.array([[3.0, -3.2], [9.0, -3.2]])
-"""Middles of the rooms, m."""
-
-ORIGIN = np.array([1.0, 0.0, 0.0])
-"""Where the robot begins, m and rad."""
-
-LASER = Settings(field_of_view=360.0, beams=720)
-
-
-def small_floor() -> Building:
-    """A hallway along x with an arm to the north, and two rooms to the south; the robot begins at its western end."""
-    plan = FloorPlan()
-    plan.cut_rectangle(0.0, -1.0, 12.0, 1.0)
-    plan.cut_rectangle(5.0, 1.0, 7.0, 9.0)
-    for x, y in ROOMS:
-        plan.cut_rectangle(x - 1.5, y - 2.0, x + 1.5, y + 2.0)
-        plan.cut_rectangle(x - 0.5, y + 1.9, x + 0.5, -0.9)
-    return Building(plan.walls(), np.array([[1.0, 0.0], [11.0, 0.0]]))
-
-
-def scan_at(pose: tuple[float, float, float]) -> Scan:
-    """What a laser all around sees of that floor."""
-    laser = Laser(LASER)
-    return laser.scan(0, 0, laser.distances(np.array([pose]), wall_index(small_floor().walls), np.empty((0, 3))))
-
-
-def view_of(scan: Scan) -> ObstacleView:
-    """What a robot with one laser sees."""
-    return LaserViews().add(scan)
-
-
-def with_keyframes(poses: dict[int, tuple[float, float, float]]) -> HybridMap:
-    """A map of one area that has these keyframes."""
-    hybrid_map = HybridMap()
-    for keyframe, pose in poses.items():
-        hybrid_map.set_keyframe(keyframe, 0, np.array(pose))
-    return hybrid_map
-
-
-class _Explored:
-    """The floor after a robot explored it."""
-
-    def __init__(self, *, explore: bool = True, changes: Mapping[str, bool] | None = None, robot: str = "") -> None:
-        scenario = Scenario(small_floor(), Settings(seed=5, laps=1, field_of_view=360.0, beams=720))
-        self.robot = DrivenRobot(scenario)
-        configuration = with_changes(Configuration(), changes or {})
-        self.run = DrivenRun(self.robot, configuration, Explorer(configuration, robot=robot))
-        self.outcome = self.run.run_task(Task("explore"), 400.0) if explore else None
-        self.length = len(path_of(self))
-
-
-@cache
-def explore(number: int = 0) -> _Explored:
-    """One and the same exploration for all tests that request this number."""
-    del number
-    return _Explored()
-
-
-def path_of(own: _Explored) -> Float64:
-    """True poses of the robot up to now, (n, 3), five a second."""
-    return own.robot.true_poses(np.arange(START, own.robot.stamp, NANOSECONDS // 5))
-
-
-def completed_task(outcome: TaskResult | None) -> TaskResult:
-    """An outcome that is there."""
-    assert outcome is not None
-    return outcome
 
 
 def test_explores_all_of_a_floor_hallways_first() -> None:
@@ -121,145 +45,6 @@ def test_explores_all_of_a_floor_hallways_first() -> None:
     entered = [int(np.argmax(np.hypot(*(path - room).T) < 1.9)) for room in ROOMS]
     arm, end = (int(np.argmax(np.hypot(*(path - place).T) < 3.5)) for place in ((6.0, 8.0), (11.0, 0.0)))
     assert min(entered) > max(arm, end) > 0
-
-
-def test_ground_of_another_robot_is_known_and_what_is_nearer_to_it_is_left_to_it() -> None:
-    own = _Explored(explore=False)
-    own.run.run_task(Task("explore"), 16.0)
-    explorer = own.run.driver
-    known = explorer.exploration_map
-    # To the end of the arm, where another robot has been; that is in the door of the left room now.
-    assert target_in_building(explorer) == pytest.approx((6.0, 8.0), abs=1.0)
-    share_ground(own, PLACES_OF_BOB)
-    own.run.run_task(Task("explore"), 2.0)
-    assert known.teammates.positions(known.roadmap.graph) == {"bob": -6} and not known.teammates.new_keyframes
-    # Not the left room: the eastern half.
-    x, y = target_in_building(explorer)
-    assert x > 7.0 and y < 1.0
-
-
-PLACES_OF_BOB = [(6.0, 2.0, 1.6), (6.0, 5.0, 1.6), (6.0, 8.0, 1.6), (6.0, 5.0, -1.6), (3.0, -1.0, -1.6)]
-"""Where another robot has been: in the arm, and in the door of the left room."""
-
-
-@pytest.mark.parametrize("has_finished", [False, True])
-def test_goals_of_other_robots_are_left_to_them_and_nothing_is_left_of_one_that_has_finished(
-    *, has_finished: bool
-) -> None:
-    own = _Explored(explore=False, robot="ann")
-    own.run.run_task(Task("explore"), 16.0)
-    explorer, scans = own.run.driver, own.run.drive(Task("explore"), 100.0)
-    share_ground(own, PLACES_OF_BOB)
-    for _ in range(10):
-        next(scans)
-    hallway = target_in_building(explorer)
-    assert hallway[0] > 7.0
-    # Cid drives there, which is known by the first keyframe of Bob.
-    place = se2.between(np.array(PLACES_OF_BOB[0]), np.array([*hallway, 0.0]))
-    explorer.handle(TeamGoal("cid", 0, False, False, TeamPlace("bob", 0, place), True, 1.0))
-    explorer.handle(TeamGoal("bob", 4, False, has_finished, None, False, 0.0))
-    for _ in range(10):
-        next(scans)
-    if has_finished:
-        assert explorer._frontiers.target is None
-        assert_it_looks_for_a_goal_once_a_second(explorer, scans)
-    else:
-        assert target_in_building(explorer) == pytest.approx((3.0, -4.8), abs=0.5)
-
-
-def assert_it_looks_for_a_goal_once_a_second(explorer: Explorer, scans: Iterator[object]) -> None:
-    """Each time it updates its roadmap, which takes longer than all else that a scan causes."""
-    choose, chosen = explorer._frontiers.choose, list[int]()
-
-    def count(here: int, *, is_on_way: bool) -> Choice:
-        chosen.append(here)
-        return choose(here, is_on_way=is_on_way)
-
-    explorer._frontiers.choose = count  # type: ignore[method-assign]
-    for _ in range(20):
-        next(scans)
-    assert 3 <= len(chosen) <= 6
-
-
-def test_an_explorer_sends_its_goal_when_it_is_another_one_and_every_ten_seconds() -> None:
-    own = _Explored(explore=False, robot="ann")
-    explorer, sent = own.run.driver, list[tuple[int, TeamGoal]]()
-    handle = explorer.handle
-
-    def note(message: Message) -> list[Message]:
-        outputs = handle(message)
-        sent.extend((own.robot.stamp, each) for each in outputs if isinstance(each, TeamGoal))
-        return outputs
-
-    explorer.handle = note  # type: ignore[method-assign]
-    own.run.run_task(Task("explore"), 40.0)
-    own.run.run_task(Task("stop"), 3.0)
-    goals = [goal for _, goal in sent]
-    stamps = {scan.stamp for scan in explorer.exploration_map.replica.scans.values()}
-    assert all(goal.robot == "ann" and goal.newest_stamp in stamps for goal in goals)
-    assert [goal.place is None for goal in goals] == [False] * (len(goals) - 1) + [True]
-    assert any(goal.reached_last for goal in goals)
-    gaps = np.diff([stamp for stamp, _ in sent]) / NANOSECONDS
-    assert len(gaps) > 3 and gaps.max() < 10.5
-
-
-def test_ground_that_changes_no_choice_keeps_the_route_and_the_time_since_the_last_progress() -> None:
-    own = _Explored(explore=False)
-    own.run.run_task(Task("explore"), 16.0)
-    explorer, scans = own.run.driver, own.run.drive(Task("explore"), 2.0)
-    next(scans)
-    route, follower = explorer._route, explorer._path_follower
-    share_ground(own, [(3.0, -1.0, -1.6)])
-    next(scans)
-    assert not explorer.exploration_map.teammates.new_keyframes
-    assert explorer._route is route and explorer._path_follower is follower
-
-
-def test_an_exploration_ends_where_only_a_room_is_left_to_another_robot() -> None:
-    own = _Explored(explore=False)
-    explorer = own.run.driver
-    for _ in own.run.drive(Task("explore"), 200.0):
-        if explorer.named_rooms():
-            break
-    robot = own.robot.pose[:2]
-    x, _ = max(ROOMS, key=lambda room: float(np.hypot(*(room - robot))))
-    share_ground(own, [(x, -1.0, -1.6)])
-    outcome = completed_task(own.run.run_task(Task("explore"), 10.0))
-    assert (
-        outcome.succeeded
-        and outcome.reason == "all is known that can be reached, or left to bob; 0 places were given up"
-    )
-    assert len(explorer.named_rooms()) == 1
-
-
-def test_an_exploration_names_no_other_robot_where_nothing_is_left() -> None:
-    own = _Explored(explore=False)
-    own.run.run_task(Task("explore"), 16.0)
-    share_ground(own, PLACES_OF_BOB)
-    own.run.run_task(Task("explore"), 2.0)
-    known, choice = own.run.driver.exploration_map, own.run.driver._frontiers
-    here = known.update_roadmap()
-    assert here is not None
-    choice._reached += [(frontier.keyframe, frontier.path[-1]) for frontier in known.roadmap.frontiers]
-    assert choice.choose(here.keyframe, is_on_way=False) == Choice(is_over=True)
-
-
-def share_ground(own: _Explored, places: list[tuple[float, float, float]]) -> None:
-    """Send an explorer ground of another robot, with a keyframe at each place of the floor."""
-    known = own.run.driver.exploration_map
-    keyframes = [
-        ForeignKeyframe(-2 - n, 0, np.array(place) - ORIGIN, replace(scan_at(place), stamp=n))
-        for n, place in enumerate(places)
-    ]
-    ground, best = ForeignGround("bob", tuple(keyframes)), known.replica.best_hypothesis
-    own.run.driver.handle(ClosureDecision(known.event, best, (), (), foreign_ground=ground))
-
-
-def target_in_building(explorer: Explorer) -> Float64:
-    """The frontier to which an explorer drives, (2,), m."""
-    target, locator = explorer._frontiers.target, explorer.exploration_map.keyframe_locator
-    assert target is not None
-    return se2.transform(locator.keyframe_pose(target.keyframe), target.path[-1]) + ORIGIN[:2]
 
 
 def test_rooms_have_names_and_the_robot_goes_there() -> None:
@@ -287,7 +72,7 @@ def test_backtracking_goes_along_its_own_path_until_stopped() -> None:
     assert own.robot.velocity == (0.0, 0.0)
 
 
-def goes(own: _Explored, *probabilities: float) -> GoalPose | None:
+def goes(own: Explored, *probabilities: float) -> GoalPose | None:
     """Where the explorer goes from now on, where so many topological paths are as probable as this; None for as before.
 
     They are all the same map.
@@ -302,7 +87,7 @@ def goes(own: _Explored, *probabilities: float) -> GoalPose | None:
 
 
 def test_it_turns_back_while_several_topological_paths_are_probable() -> None:
-    own = _Explored(explore=False, changes={"explorer.backtracks": True})
+    own = Explored(explore=False, changes={"explorer.backtracks": True})
     assert own.run.run_task(Task("explore"), 25.0) is None
     back = goes(own, 0.6, 0.4)
     assert back is not None
@@ -316,7 +101,7 @@ def test_it_turns_back_while_several_topological_paths_are_probable() -> None:
 
 
 def test_it_explores_on_where_nobody_requests_it_to_turn_back() -> None:
-    own = _Explored(explore=False)
+    own = Explored(explore=False)
     assert own.run.run_task(Task("explore"), 25.0) is None
     assert own.run.driver.exploration_map.entropy == 0.0
     on = goes(own, 0.6, 0.4)
@@ -324,7 +109,7 @@ def test_it_explores_on_where_nobody_requests_it_to_turn_back() -> None:
     assert on is None or np.hypot(*on.pose[:2]) > 1.0
 
 
-def ambiguity_along(own: _Explored, keyframes: list[int], entropy: float = 0.6) -> Ambiguity:
+def ambiguity_along(own: Explored, keyframes: list[int], entropy: float = 0.6) -> Ambiguity:
     """Looks along the keyframes, of which the last one decides; for the map as it is."""
     atlas = own.run.driver.exploration_map
     places = [atlas.keyframe_locator.area_and_pose(keyframe) for keyframe in keyframes]
@@ -333,7 +118,7 @@ def ambiguity_along(own: _Explored, keyframes: list[int], entropy: float = 0.6) 
     return Ambiguity(atlas.event, entropy, tuple(looks) if entropy else (), "")
 
 
-def way_to(own: _Explored, place: str) -> list[int]:
+def way_to(own: Explored, place: str) -> list[int]:
     """The keyframes on the way from the robot to a place."""
     atlas = own.run.driver.exploration_map
     here = atlas.update_roadmap()
@@ -396,7 +181,7 @@ def test_a_goal_is_kept_while_a_look_there_tells_half_as_much_per_meter() -> Non
 
 def test_an_exploration_is_interrupted_for_looks_where_that_is_wanted() -> None:
     for wanted in (True, False):
-        own = _Explored(explore=False, changes={"explorer.disambiguates": wanted})
+        own = Explored(explore=False, changes={"explorer.disambiguates": wanted})
         assert own.run.run_task(Task("explore"), 25.0) is None
         explorer = own.run.driver
         explorer.handle(ambiguity_along(own, way_to(own, "area 0")))
@@ -409,7 +194,7 @@ def test_an_exploration_is_interrupted_for_looks_where_that_is_wanted() -> None:
 
 
 def test_scans_may_come_after_any_message_of_the_chain() -> None:
-    own = _Explored(explore=False)
+    own = Explored(explore=False)
     assert own.run.run_task(Task("explore"), 25.0) is None
     explorer, atlas = own.run.driver, own.run.driver.exploration_map
     replica, pose = atlas.replica, atlas.pose
@@ -443,7 +228,7 @@ def test_a_known_map_is_known_from_the_start() -> None:
 
 
 def test_it_stands_where_nothing_tells_the_pose_any_more() -> None:
-    own = _Explored(explore=False)
+    own = Explored(explore=False)
     own.run.run_task(Task("explore"), 5.0)
     scan = own.robot.measure()[1] or scan_at((1.0, 0.0, 0.0))
     moving, lost = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from test_exploration import LASER, ROOMS, scan_at, small_floor, with_keyframes
+from explored_floor import LASER, ROOMS, scan_at, small_floor, with_keyframes
 
 from hmt_slam_ros.arrays import Float64
 from hmt_slam_ros.configuration import Configuration
