@@ -218,10 +218,10 @@ class AreaMemory(NamedTuple):
 
 def weigh_areas(lattice: Lattice) -> AreaMemory:
     """Measure the memory of the areas of a lattice, each with distinct scans."""
-    graph = _measure_memory(lattice.hybrid_map)[0] / lattice.areas
+    graph = measure_memory(lattice.hybrid_map)[0] / lattice.areas
     _make_scan(0)
-    scans, kept = _measure_memory(lambda: [_make_scan(keyframe) for keyframe in range(_AREAS_OF_SCANS * PER_AREA)])
-    points, _ = _measure_memory(lambda: [scan.points for scan in kept])
+    scans, kept = measure_memory(lambda: [_make_scan(keyframe) for keyframe in range(_AREAS_OF_SCANS * PER_AREA)])
+    points, _ = measure_memory(lambda: [scan.points for scan in kept])
     return AreaMemory(graph, scans / _AREAS_OF_SCANS, points / _AREAS_OF_SCANS)
 
 
@@ -229,7 +229,7 @@ def _make_scan(keyframe: int) -> Scan:
     return scan_at(np.zeros(3), keyframe, keyframe, BEAMS)
 
 
-def _measure_memory(make: Callable[[], Made]) -> tuple[float, Made]:
+def measure_memory(make: Callable[[], Made]) -> tuple[float, Made]:
     """The memory of a value, kB, and the value."""
     tracemalloc.start()
     try:

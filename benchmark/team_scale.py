@@ -1,4 +1,4 @@
-"""Cost of the process team in maps of up to a thousand areas: a step of the search, and a comparison at its end."""
+"""Cost of the process team in maps of up to a thousand areas: steps, comparisons, load of robots that drive, memory."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
+from benchmark import team_load
 from benchmark.lattice import Lattice, LatticeScans
 from benchmark.report import Report, Requirement, table
 from benchmark.settings import Settings
@@ -50,10 +51,13 @@ class TeamCost(NamedTuple):
 
 def measure_team_scale(settings: Settings) -> Report:
     """Measure lattices of growing size."""
-    costs = [measure_cost(lattice, settings.configuration) for lattice in LATTICES]
+    configuration = settings.configuration
+    costs = [measure_cost(lattice, configuration) for lattice in LATTICES]
+    loads = [team_load.measure_load(lattice, configuration) for lattice in team_load.LATTICES]
+    memory = team_load.weigh_ground(configuration)
     report = Report("team_scale", "Cost of the process team in large maps")
-    report.requirements = requirements(costs)
-    report.body = [cost_table(costs), POLICY]
+    report.requirements = [*requirements(costs), *team_load.requirements(loads, memory)]
+    report.body = [cost_table(costs), POLICY, team_load.load_table(loads, memory), team_load.POLICY]
     return report
 
 

@@ -8,6 +8,7 @@ from hmt_slam_ros.messages.team import Verdict
 from hmt_slam_ros.team.components import Component, Shift, combine
 from hmt_slam_ros.team.join import judge
 from hmt_slam_ros.team.placement_search import PlacementSearch
+from hmt_slam_ros.topological_inference.map_search import MapSearch
 
 WORLD = "sim:office,size=0.7,seed=51"
 SHIFT = Shift(1000, 10_000)
@@ -93,10 +94,24 @@ def test_what_was_searched_is_not_searched_twice():
     assert sum(grown) <= 1.4 * whole[0]
 
 
-def test_areas_that_are_new_are_searched_alone():
-    _, steps = search_parts((0.5, 1.0), (1.0, 1.0))
-    _, whole = search_parts((1.0, 1.0))
-    assert 0 < steps[1] < whole[0]
+def test_areas_that_are_new_are_searched_alone(monkeypatch):
+    searched, continue_search = [], MapSearch.continue_search
+
+    def count(map_search, hybrid_map, search):
+        found = continue_search(map_search, hybrid_map, search)
+        searched[-1] += len(search.unexamined) - len(found.unexamined)
+        return found
+
+    monkeypatch.setattr(MapSearch, "continue_search", count)
+    search = PlacementSearch(CONFIGURATION)
+    for first in (0.5, 1.0):
+        searched.append(0)
+        search.update(combine(part(lap(0), first), part(lap(1), 1.0), SHIFT))
+        finish(search)
+    windows, known = len(search.windows), part(lap(0), 0.5).hybrid_map
+    # The area in which the first half ends has new keyframes.
+    new = len(lap(0).hybrid_map.area_ids()) - len(known.area_ids()) + 1
+    assert searched == [windows * len(known.area_ids()), windows * new]
 
 
 def test_maps_are_not_joined_before_they_meet():

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-_STANDING_TIME, _PERIOD = 3.0, 0.5
-"""Time after the last keyframe event from which a robot stands, and least time between two own statuses then, s."""
+_STANDING_TIME = 3.0
+"""Time after the last keyframe event from which a robot stands, s."""
+
+PERIOD = 0.5
+"""Least time between two own statuses of a robot that stands, s."""
 
 
 class StandingTimer:
@@ -25,5 +28,5 @@ class StandingTimer:
 
     def is_due(self, now: float, *, is_searching: bool) -> bool:
         """Whether the own status is to come now."""
-        stands = now - self._event_at > _STANDING_TIME and now - self._status_at > _PERIOD
+        stands = now - self._event_at > _STANDING_TIME and now - self._status_at > PERIOD
         return stands and (is_searching or self._status_at < self._event_at)

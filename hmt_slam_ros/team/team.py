@@ -28,7 +28,9 @@ from hmt_slam_ros.team.join_state import JoinState, next_join
 from hmt_slam_ros.team.placement_search import PlacementSearch
 from hmt_slam_ros.team.rendezvous import KnownRendezvous
 from hmt_slam_ros.team.repetition import RepetitionTest
+from hmt_slam_ros.team.search_budget import SearchBudget
 from hmt_slam_ros.team.shared_map import ForeignMap, ForeignMapState, SharedMap, SharedMapState
+from hmt_slam_ros.team.standing import PERIOD
 from hmt_slam_ros.team.team_frame import team_poses
 
 _SHIFT = Shift(MAX_TEAM_AREAS, MAX_TEAM_KEYFRAMES)
@@ -37,8 +39,8 @@ _SHIFT = Shift(MAX_TEAM_AREAS, MAX_TEAM_KEYFRAMES)
 _MIN_GROWTH = 16
 """New keyframes of both robots after which their maps are compared again, unless the robots stand."""
 
-_WORK = 160_000_000
-"""Work of the search after an event, about 240 ms: it is that of eight keyframe events."""
+_KEYFRAME_WORK = 20_000
+"""Work of a comparison for each keyframe of both maps, beside that of the search: about 30 microseconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,7 @@ class _PairState:
     :ivar is_outdated: whether one of them changed since the search began or went on.
     :ivar meeting: what the search found at its end, None before.
     :ivar keyframes: number of keyframes of both when it was compared last.
+    :ivar turn: number of this comparison among those of all pairs, 0 before the first.
     :ivar join: how far the join is.
     """
 
@@ -79,7 +82,7 @@ class _PairState:
         self.is_outdated = True
         self.meeting: Meeting | None = None
         self.is_judged = True
-        self.keyframes = 0
+        self.keyframes = self.turn = 0
         self.join = join
 
 
@@ -122,6 +125,7 @@ class Team:
         self._pairs = {name: _PairState(configuration, state.joins.get(name, JoinState())) for name in state.others}
         self._placements = {(each.robot, each.first, each.second): each for each in state.placements}
         self._rendezvous = KnownRendezvous(state.robot, state.rendezvous)
+        self._budget, self._turns = SearchBudget(), 0
         self.map_poses = team_poses(state.robot, state.placements)
         self._update_own()
 
@@ -188,10 +192,11 @@ class Team:
         """Follow the robot's map; a decision is shared."""
         if isinstance(message, ClosureDecision):
             self._replica.apply_decision(message)
-            return [*self._share(), *self.search(_WORK)]
+            return [*self._share(), *self._search(self._budget)]
         self._replica.apply_message(message)
         if isinstance(message, Keyframe):
             self._note_clutter(message)
+            self._budget.note_stamp(message.scan.stamp)
         return []
 
     def _note_clutter(self, keyframe: Keyframe) -> None:
@@ -219,7 +224,8 @@ class Team:
         """
         name = status.robot
         if name == self._robot:
-            return [*self._share(is_standing=True), *self.search(_WORK, may_wait=False)]
+            self._budget.add_time(PERIOD)
+            return [*self._share(is_standing=True), *self._search(self._budget, may_wait=False)]
         if name not in self._others and len(self._others) == MAX_ROBOTS:
             return []
         known = self._others.get(name)
@@ -291,38 +297,43 @@ class Team:
 
         :param may_wait: whether a search may wait until the maps have grown some more.
         """
+        return self._search(SearchBudget(work), may_wait=may_wait)
+
+    def _search(self, budget: SearchBudget, *, may_wait: bool = True) -> list[Message]:
+        """The same within a budget. The pair that was compared the longest ago comes first."""
         growth = _MIN_GROWTH if may_wait else 0
-        answers, work = self._test_repetition(work, growth)
-        for name, pair in sorted(self._pairs.items()):
+        answers = self._test_repetition(budget, growth)
+        for name, pair in sorted(self._pairs.items(), key=lambda item: (item[1].turn, item[0])):
             # A search ends with the maps with which it began: maps that grow would put its end off again and again.
-            if pair.is_outdated and pair.is_judged:
-                self._update(name, pair, growth)
-            while work > 0 and not pair.is_judged:
+            if pair.is_outdated and pair.is_judged and budget.is_left:
+                self._update(name, pair, growth, budget)
+            while budget.is_left and not pair.is_judged:
                 done = pair.search.step()
                 if done is None:
                     answers += self._judge(name, pair)
-                work -= done or 0
+                budget.spend(done or 0)
         return answers
 
-    def _test_repetition(self, work: int, growth: int) -> tuple[list[Message], int]:
+    def _test_repetition(self, budget: SearchBudget, growth: int) -> list[Message]:
         """Go on with the search of the own map in itself, if there is another robot, and it has grown enough.
 
-        :returns: the status where the evidence is new, and how much of the work is left.
+        :returns: the status where the evidence is new.
         """
         own, test = self._own, self._repetition
         grown = own.scan_count - self._tested_keyframes
-        if test.is_done and self._is_untested and not 0 <= grown < growth:
+        if test.is_done and self._is_untested and not 0 <= grown < growth and budget.is_left:
             self._tested_version, self._tested_keyframes = own.version, own.scan_count
             if own.scan_count:
                 test.update(own.component(), _SHIFT)
-        while work > 0 and not test.is_done:
-            work -= test.step()
+                budget.spend(_KEYFRAME_WORK * 2 * own.scan_count)
+        while budget.is_left and not test.is_done:
+            budget.spend(test.step())
         if not test.is_done or test.log_ratio == own.log_repetition:
-            return [], work
+            return []
         own.log_repetition = test.log_ratio
         for pair in self._pairs.values():
             pair.is_outdated = True
-        return [self.status], work
+        return [self.status]
 
     @property
     def _is_untested(self) -> bool:
@@ -335,7 +346,7 @@ class Team:
             return True
         return any(pair.is_outdated or not pair.is_judged for pair in self._pairs.values())
 
-    def _update(self, name: str, pair: _PairState, growth: int) -> None:
+    def _update(self, name: str, pair: _PairState, growth: int, budget: SearchBudget) -> None:
         """Let the search of a pair go on with the maps of now, if both have areas, and have grown enough."""
         keyframes = self._own.scan_count + self._others[name].map.scan_count
         # Keyframes are pruned, too.
@@ -347,11 +358,14 @@ class Team:
             first, second = (own, other) if self._robot < name else (other, own)
             pair.search.update(combine(first, second, _SHIFT), self._rendezvous.with_robot(name))
             pair.is_judged = False
+            budget.spend(_KEYFRAME_WORK * keyframes)
 
     def _judge(self, name: str, pair: _PairState) -> list[Message]:
         """The answer at the end of a search, where it differs from the one before."""
         meeting = pair.meeting = judge(pair.search, self._configuration)
         pair.is_judged = True
+        self._turns += 1
+        pair.turn = self._turns
         first, second = sorted((self._robot, name))
         before, holds = pair.join, pair.join.holds(meeting)
         has_lasted = holds or was_sure(pair.search, meeting, self._configuration)
