@@ -57,7 +57,10 @@ class _WindowSearch:
 
 
 class PlacementSearch:
-    """Searches every window of the second component in every area of the first, each once while it stays as it is."""
+    """Searches every window of the second component in every area of the first, each once while it stays as it is.
+
+    :ivar comparison_work: of all distributions until now.
+    """
 
     def __init__(self, configuration: Configuration, exclusion: Exclusion | None = None) -> None:
         """:param exclusion: of a pair: the areas in which each window is not searched."""
@@ -71,6 +74,7 @@ class PlacementSearch:
         self._searches: dict[Keyframes, _WindowSearch] = {}
         self._outdated: dict[Keyframes, Window] = {}
         self._known: dict[int, Keyframes] = {}
+        self.comparison_work = 0
 
     @property
     def pair(self) -> ComponentPair:
@@ -154,7 +158,9 @@ class PlacementSearch:
         prior = PlacementPrior.of_pair(len(pair.known), len(pair.other), pair.log_repetition)
         geometry = PlacementGeometry(pair.hybrid_map, windows)
         comparison = PlaceComparison(pair, windows, geometry, self._configuration, self._map_search.grid_cache)
-        return placement_distribution(geometry, candidates, pair.joint, prior, comparison.log_ratio)
+        found = placement_distribution(geometry, candidates, pair.joint, prior, comparison.log_ratio)
+        self.comparison_work += comparison.work
+        return found
 
     def _candidates(self, number: int, window: Window | RendezvousWindow) -> list[WindowCandidate]:
         if isinstance(window, RendezvousWindow):

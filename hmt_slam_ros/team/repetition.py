@@ -59,8 +59,10 @@ class RepetitionTest:
         """Take the next step, and return its work; at the end ``log_ratio`` is new."""
         work = self._search.step()
         if work is None:
+            before = self._search.comparison_work
             self.log_ratio, self.is_done = _log_ratio(self._search), True
-        return work or 0
+            work = self._search.comparison_work - before
+        return work
 
 
 def add_repetition(component: Component, configuration: Configuration) -> Component:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hmt_slam_ros.logs.stamps import NANOSECONDS
 
 _WORK_PER_SECOND = 50_000_000
-"""Work in a second of the robot's time: about 75 ms, and up to twice that where all looks alike (:mod:`hmt_slam_ros.topological_inference.event_work`)."""
+"""Work in a second of the robot's time: about 75 ms, and up to twice that where all looks alike."""
 
 _MAX_WORK = 160_000_000
 """Most work that adds up while nothing is searched, about 240 ms: that of an event."""

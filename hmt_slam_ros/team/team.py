@@ -310,8 +310,10 @@ class Team:
             while budget.is_left and not pair.is_judged:
                 done = pair.search.step()
                 if done is None:
+                    before = pair.search.comparison_work
                     answers += self._judge(name, pair)
-                budget.spend(done or 0)
+                    done = pair.search.comparison_work - before
+                budget.spend(done)
         return answers
 
     def _test_repetition(self, budget: SearchBudget, growth: int) -> list[Message]:
