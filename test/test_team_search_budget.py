@@ -18,12 +18,15 @@ RATE = search_budget._WORK_PER_SECOND
 
 
 def work_of(budget):
-    """The work that is left, by the steps of one unit that begin."""
+    """The work that is left, in seconds, by steps that begin in as many events as it takes."""
     count = 0
-    while budget.is_left:
-        budget.spend(RATE // 100)
-        count += 1
-    return count / 100
+    while True:
+        budget.begin_event()
+        if not budget.is_left:
+            return count / 100
+        while budget.is_left:
+            budget.spend(RATE // 100)
+            count += 1
 
 
 def test_work_grows_with_the_stamps_of_keyframes():
@@ -41,27 +44,40 @@ def test_work_that_was_too_much_is_paid_by_the_next_events():
     budget.spend(RATE)
     for stamp in (0.0, 0.5, 0.99):
         budget.note_stamp(round(stamp * NANOSECONDS))
+        budget.begin_event()
         assert not budget.is_left
     budget.note_stamp(2 * NANOSECONDS)
     assert work_of(budget) == 1.0
 
 
-def test_stamps_that_jump_add_no_work_back_and_that_of_an_event_ahead():
+def test_stamps_that_jump_back_add_no_work_and_those_that_jump_ahead_that_of_a_minute():
     budget = SearchBudget()
     for stamp in (100.0, 2.0):
         budget.note_stamp(round(stamp * NANOSECONDS))
+    budget.begin_event()
     assert not budget.is_left
     budget.note_stamp(10**6 * NANOSECONDS)
-    assert work_of(budget) == search_budget._MAX_WORK / RATE
+    assert work_of(budget) == 60.0
+
+
+def test_saved_work_is_not_done_at_one_event():
+    budget = SearchBudget()
+    budget.add_time(60.0)
+    for _ in range(2):
+        budget.begin_event()
+        budget.spend(search_budget._EVENT_WORK - 1)
+        assert budget.is_left
+        budget.spend(1)
+        assert not budget.is_left
 
 
 def test_robots_that_drive_on_in_large_maps_do_no_more_work_than_their_share(monkeypatch):
-    spent, steps = Counter(), Counter()
+    spent, steps, spend_in = Counter(), Counter(), SearchBudget.spend
 
     def spend(budget, work):
         spent[id(budget)] += work
         steps[id(budget)] = max(steps[id(budget)], work)
-        budget._left -= work
+        spend_in(budget, work)
 
     monkeypatch.setattr(SearchBudget, "spend", spend)
     events = 12

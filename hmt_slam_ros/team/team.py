@@ -192,6 +192,7 @@ class Team:
         """Follow the robot's map; a decision is shared."""
         if isinstance(message, ClosureDecision):
             self._replica.apply_decision(message)
+            self._budget.begin_event()
             return [*self._share(), *self._search(self._budget)]
         self._replica.apply_message(message)
         if isinstance(message, Keyframe):
@@ -225,6 +226,7 @@ class Team:
         name = status.robot
         if name == self._robot:
             self._budget.add_time(PERIOD)
+            self._budget.begin_event()
             return [*self._share(is_standing=True), *self._search(self._budget, may_wait=False)]
         if name not in self._others and len(self._others) == MAX_ROBOTS:
             return []
