@@ -78,7 +78,9 @@ def test_matches_count_in_the_areas_that_are_searched_alone(monkeypatch):
     searched, matched = [], []
     cells = SearchCells(np.zeros((1, 3), np.int64), np.ones(1), np.zeros(1), 7)
     monkeypatch.setattr(module, "find_cells", lambda *given: searched.append(given) or cells)
-    monkeypatch.setattr(module, "match_areas", lambda *given: matched.append(given) or SimpleNamespace(modes=modes))
+    monkeypatch.setattr(
+        module, "match_areas", lambda *given: matched.append(given) or SimpleNamespace(modes=modes, work=9)
+    )
     places = {2.0: 2, 3.0: 3, -1.0: None, 2.5: 2}
     monkeypatch.setattr(module, "containing_area", lambda _place, poses, _radius: places[float(poses[0, 0])])
     grid = module.AreaGrid(
@@ -93,7 +95,7 @@ def test_matches_count_in_the_areas_that_are_searched_alone(monkeypatch):
     matcher = GlobalScanMatcher(cache, None, MatchSettings(temper=0.1, margin=2.0), 1.5, 6.0)
     search = (known, np.array([2, 3, 2]), grid, {7: np.zeros(3)}, {2}, 0.8)
     found, work = matcher._match_keyframes(*search)
-    assert work == 7
+    assert work == 9 + len(modes) * module._MODE_WORK
     assert [(each.area, each.mode) for each in found] == [(2, modes[0]), (2, modes[3])]
     sparse_query, given_surface, back, prior, settings, bounds, constraint = searched[0]
     assert matched[0][1] is grid
