@@ -56,7 +56,7 @@ class Lattice(NamedTuple):
     def hybrid_map(self) -> HybridMap:
         """The definite map: keyframes along both corridors of every crossing, and an arc to each of the next ones."""
         hybrid_map = HybridMap()
-        places = [_pose_in_crossing(offset, quarter) for quarter in range(2) for offset in OFFSETS]
+        places = [pose_in_crossing(offset, quarter) for quarter in range(2) for offset in OFFSETS]
         for area in range(self.areas):
             first = FIRST_KEYFRAME + PER_AREA * area
             hybrid_map.changed_areas[area] = {first + k: place.copy() for k, place in enumerate(places)}
@@ -85,7 +85,7 @@ def _make_arc(x: float, y: float) -> PoseGaussian:
     return PoseGaussian(np.array([x, y, 0.0]), ARC.copy())
 
 
-def _pose_in_crossing(offset: float, quarter: int) -> Float64:
+def pose_in_crossing(offset: float, quarter: int) -> Float64:
     """``crossing_T_base`` (3,) at an offset along a corridor, with a heading in quarter turns."""
     return np.asarray(se2.compose([0.0, 0.0, 0.5 * math.pi * quarter], [offset, 0.0, 0.0]))
 
@@ -93,7 +93,7 @@ def _pose_in_crossing(offset: float, quarter: int) -> Float64:
 @cache
 def shared_scan(offset: float, quarter: int) -> Scan:
     """The scan at one of ``OFFSETS`` along a corridor, which is the same at every crossing."""
-    return scan_at(_pose_in_crossing(offset, quarter), 0, quarter)
+    return scan_at(pose_in_crossing(offset, quarter), 0, quarter)
 
 
 def scan_at(pose: Float64, stamp: int, seed: int, beams: int = BEAMS) -> Scan:
@@ -134,5 +134,5 @@ def make_stops(crossings: Sequence[tuple[int, int]]) -> Iterator[LatticeStop]:
         for offset in OFFSETS:
             center = np.array([SPACING * next_column, SPACING * next_row, 0.0])
             yield LatticeStop(
-                center + _pose_in_crossing(offset, quarter), shared_scan(offset, quarter), offset == OFFSETS[-1]
+                center + pose_in_crossing(offset, quarter), shared_scan(offset, quarter), offset == OFFSETS[-1]
             )

@@ -219,13 +219,14 @@ class AreaMemory(NamedTuple):
 def weigh_areas(lattice: Lattice) -> AreaMemory:
     """Measure the memory of the areas of a lattice, each with distinct scans."""
     graph = measure_memory(lattice.hybrid_map)[0] / lattice.areas
-    _make_scan(0)
-    scans, kept = measure_memory(lambda: [_make_scan(keyframe) for keyframe in range(_AREAS_OF_SCANS * PER_AREA)])
+    make_scan(0)
+    scans, kept = measure_memory(lambda: [make_scan(keyframe) for keyframe in range(_AREAS_OF_SCANS * PER_AREA)])
     points, _ = measure_memory(lambda: [scan.points for scan in kept])
     return AreaMemory(graph, scans / _AREAS_OF_SCANS, points / _AREAS_OF_SCANS)
 
 
-def _make_scan(keyframe: int) -> Scan:
+def make_scan(keyframe: int) -> Scan:
+    """A distinct scan of a keyframe in a crossing, of ``BEAMS`` beams."""
     return scan_at(np.zeros(3), keyframe, keyframe, BEAMS)
 
 

@@ -29,5 +29,6 @@ def test_foreign_ground_takes_no_more_memory_than_own_ground():
 def test_a_load_above_a_fifth_of_a_core_and_more_memory_than_for_own_ground_fail():
     memory, loads = TeamMemory(10.0, 12.0), [TeamLoad(100, 0.1, 0.5), TeamLoad(1000, 0.21, 1.0)]
     assert [each.is_met for each in load_requirements(loads, memory)] == [False, False]
+    assert not load_requirements(loads[::-1], memory)[0].is_met
     assert [each.is_met for each in load_requirements(loads[:1], TeamMemory(10.0, 10.0))] == [True, True]
     assert "| 1000 | 21.0 % | 1.00 s |" in load_table(loads, memory)
