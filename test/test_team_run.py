@@ -253,24 +253,24 @@ def test_the_number_of_robots_is_bounded():
 
 @pytest.mark.parametrize("limit", [1, 50_000_000])
 def test_the_work_of_an_event_is_bounded(monkeypatch, limit):
-    """No step begins after so much work."""
+    """No step, update or comparison begins after so much work."""
     run, _, _ = office_run()
-    steps, step = [], team_module.PlacementSearch.step
+    spent, spend = [], team_module.SearchBudget.spend
 
-    def count(search):
-        steps.append(step(search))
-        return steps[-1]
+    def count(budget, work):
+        spent.append(work)
+        spend(budget, work)
 
-    monkeypatch.setattr(team_module.PlacementSearch, "step", count)
+    monkeypatch.setattr(team_module.SearchBudget, "spend", count)
     bob, waiting = deepcopy(run.teams["bob"]), [replace(run.teams["ann"].status, robot="abe")]
     while waiting:
         for request in bob.handle(waiting.pop()):
             update = run.teams["ann"].handle(replace(request, owner="ann", robot="eve"))[0]
             waiting.append(replace(update, robot="abe"))
     assert bob.is_searching
+    spent.clear()
     bob.search(limit)
-    work = [done or 0 for done in steps]
-    assert sum(work[:-1]) < limit
+    assert sum(spent[:-1]) < limit <= sum(spent)
     while bob.is_searching:
         bob.search(2 * limit)
     assert bob.meetings["abe"].verdict is Verdict.JOINED
