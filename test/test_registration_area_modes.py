@@ -16,7 +16,8 @@ from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.registration import area_to_area, match_modes
 from hmt_slam_ros.registration.area_to_area import MatchMode, MatchSettings
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
-from hmt_slam_ros.registration.search_bounds import LogRatioGrid, make_search_window
+from hmt_slam_ros.registration.search_bounds import LogRatioGrid
+from hmt_slam_ros.registration.search_window import make_search_window
 
 SETTINGS = MatchSettings(temper=TEMPER)
 TO_MIDDLE = PoseGaussian.from_pose(np.array([0.7, -0.4, 0.0]))

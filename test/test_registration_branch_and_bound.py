@@ -7,7 +7,8 @@ import pytest
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.registration.branch_and_bound import search_cells
-from hmt_slam_ros.registration.search_bounds import LogRatioGrid, make_search_window
+from hmt_slam_ros.registration.search_bounds import LogRatioGrid
+from hmt_slam_ros.registration.search_window import make_search_window
 
 
 def brute_force(window, surface, samples, back, back_samples, temper):

@@ -10,7 +10,8 @@ from scipy.ndimage import gaussian_filter, label, map_coordinates
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.registration import match_modes
 from hmt_slam_ros.registration.branch_and_bound import SearchCells
-from hmt_slam_ros.registration.search_bounds import LogRatioGrid, make_search_window
+from hmt_slam_ros.registration.search_bounds import LogRatioGrid
+from hmt_slam_ros.registration.search_window import make_search_window
 
 CELL, ORIGIN = 0.1, np.array([-2.0, -1.5])
 TEMPER = 0.7

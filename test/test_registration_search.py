@@ -39,13 +39,12 @@ from hmt_slam_ros.registration.search_bounds import (
     count_known,
     group_turns,
     lattice_bounds,
-    make_search_window,
-    prior_bound,
     quarter_bounds,
     sample_cells,
     sort_by_phase,
     turns_in_group,
 )
+from hmt_slam_ros.registration.search_window import make_search_window, prior_bound
 
 
 def values_at(level, cells, i, j):

@@ -22,7 +22,8 @@ from hmt_slam_ros.registration import match_modes
 from hmt_slam_ros.registration.branch_and_bound import SearchCells, search_cells
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 from hmt_slam_ros.registration.position_constraint import PositionConstraint
-from hmt_slam_ros.registration.search_bounds import LogRatioGrid, SearchWindow, make_search_window
+from hmt_slam_ros.registration.search_bounds import LogRatioGrid
+from hmt_slam_ros.registration.search_window import SearchWindow, make_search_window
 
 _MAX_SADDLE_DEPTH = 3.0
 """Depth of the pass between two peaks of one cluster at most, nats."""

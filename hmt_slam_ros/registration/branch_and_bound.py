@@ -36,7 +36,6 @@ from hmt_slam_ros.registration.search_bounds import (
     PhasedLevel,
     Pyramid,
     SearchMemory,
-    SearchWindow,
     SquareRange,
     TurnGroups,
     add_block,
@@ -44,12 +43,12 @@ from hmt_slam_ros.registration.search_bounds import (
     count_known,
     group_turns,
     lattice_bounds,
-    prior_bound,
     quarter_bounds,
     sample_cells,
     sort_by_phase,
     turns_in_group,
 )
+from hmt_slam_ros.registration.search_window import SearchWindow, prior_bound
 
 
 class ReverseCheck(NamedTuple):

@@ -10,7 +10,8 @@ from hmt_slam_ros.arrays import Float64, Int32, Int64
 from hmt_slam_ros.compilation import njit
 from hmt_slam_ros.geometry.se2 import rotate_back, transform_point
 from hmt_slam_ros.registration.branch_and_bound import SearchCells
-from hmt_slam_ros.registration.search_bounds import LogRatioGrid, SearchWindow
+from hmt_slam_ros.registration.search_bounds import LogRatioGrid
+from hmt_slam_ros.registration.search_window import SearchWindow
 
 _DIVIDED = 400
 """Cells that are divided for the quadrature, the highest ones; all others count by their center."""

@@ -16,12 +16,12 @@ from hmt_slam_ros.registration.search_bounds import (
     LogRatioGrid,
     Pyramid,
     SearchMemory,
-    SearchWindow,
     TurnGroups,
     build_pyramid,
     group_turns,
     sample_cells,
 )
+from hmt_slam_ros.registration.search_window import SearchWindow
 
 _OWN, _AROUND = 1.0, 0.5
 """Values of cells near a position that is searched, and near one around those."""
