@@ -137,6 +137,18 @@ def test_in_which_of_two_equal_rooms_a_map_lies_stays_open():
     assert abs(one.pose[0] - other.pose[0]) == pytest.approx(30.0, abs=0.1)
 
 
+def test_the_pose_of_a_placement_is_between_the_frames_of_the_maps():
+    """The components are pieces of maps, with another first area."""
+    first, second = rooms((0.0, 30.0), 0), rooms((0.0,), 5)
+    one, other = np.array([3.0, 1.0, 0.5]), np.array([-2.0, 4.0, -1.0])
+    plain = meet(first, second, CONFIGURATION).distribution.placements
+    found = meet(replace(first, pose=one), replace(second, pose=other), CONFIGURATION).distribution.placements
+    for before, now in zip(plain, found, strict=True):
+        assert now.probability == before.probability
+        expected = se2.compose(se2.compose(one, before.pose), se2.inverse(other))
+        assert now.pose.tolist() == expected.tolist()
+
+
 def matched_at(shift):
     """Two rows of areas, and a sure placement by matches of two windows, the second of which is shifted, m."""
     pair = combine(rooms((0.0, 30.0), 0), rooms((0.0, 30.0), 5))

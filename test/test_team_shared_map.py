@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import worlds
 
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
+from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.team import shared_map
 from hmt_slam_ros.team.shared_map import NEW_KEYFRAMES, ForeignMap, ForeignMapState, SharedMap
@@ -172,6 +174,27 @@ def test_a_keyframe_that_moved_is_in_one_area():
     other = ForeignMap(ForeignMapState("a"))
     receive(other, robot)
     assert_same(other, robot, [0, 1])
+
+
+def test_of_a_map_in_pieces_the_largest_is_the_component():
+    """A robot is kidnapped: what it maps then is a piece of its own until its place is found."""
+    robot, foreign, lost = with_three_areas(), ForeignMap(ForeignMapState("a")), np.array([10.0, 5.0, 1.0])
+    robot.join(2, 3, uninformative_belief(lost))
+    robot.map_keyframes(3, 17)
+    robot.map_keyframes(4, 1)
+    receive(foreign, robot)
+    # As many keyframes as the older piece.
+    assert_same(foreign, robot, [0, 1, 2])
+    np.testing.assert_array_equal(foreign.component().pose, np.zeros(3))
+    robot.join(3, 4)
+    robot.map_keyframes(4, NEW_KEYFRAMES)
+    receive(foreign, robot)
+    assert_same(foreign, robot, [3, 4])
+    assert foreign.component().pose.tolist() == se2.compose([8.0, 0.0, 0.0], lost).tolist()
+    robot.join(2, 3)
+    receive(foreign, robot)
+    assert_same(foreign, robot, [0, 1, 2, 3, 4])
+    np.testing.assert_array_equal(foreign.component().pose, np.zeros(3))
 
 
 def test_a_large_map_comes_in_parts(monkeypatch):

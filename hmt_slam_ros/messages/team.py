@@ -139,7 +139,7 @@ class TeamPlacement:
         contradictory, as the arcs of a sure placement contradict one another.
     :ivar probability: of the most probable placement, 0 where there is none.
     :ivar apart: probability that they have no common ground, or lie otherwise.
-    :ivar pose: shape (3,), ``first_T_second`` of the frames of the robots' first areas under that placement, m, rad.
+    :ivar pose: shape (3,), ``first_T_second`` of the frames of the robots' maps under that placement, m, rad.
     """
 
     robot: str

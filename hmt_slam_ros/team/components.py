@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from hmt_slam_ros.arrays import Float64
+from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.pose_graph import consistent_map
 from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
 from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions
+from hmt_slam_ros.messages.map_changes import Pose
 from hmt_slam_ros.registration.consistency import MAPS_OUTLIER_RATE, NO_CLUTTER, Clutter
 from hmt_slam_ros.sensors import Scan
 
@@ -28,12 +30,14 @@ class Component:
     :ivar scans: {keyframe: scan} of its keyframes.
     :ivar clutter: usual rate of contradictions of the map.
     :ivar log_repetition: log Bayes factor of a building that repeats itself, from this map in itself, nats.
+    :ivar pose: shape (3,), of its first area in the frame of the robot's map, of which it may be a piece.
     """
 
     hybrid_map: HybridMap
     scans: Mapping[int, Scan]
     clutter: Clutter = NO_CLUTTER
     log_repetition: float = 0.0
+    pose: Pose = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
     def of_map(
@@ -77,6 +81,7 @@ class ComponentPair:
     :ivar area_shift: added to the numbers of the second's areas.
     :ivar clutters: usual rates of contradictions of the first and of the second.
     :ivar log_repetition: log Bayes factor of a building that repeats itself, from both maps, nats.
+    :ivar poses: of the first areas of both in the frames of the robots' maps, each of shape (3,).
     """
 
     hybrid_map: HybridMap
@@ -87,6 +92,7 @@ class ComponentPair:
     area_shift: int
     clutters: tuple[Clutter, Clutter]
     log_repetition: float
+    poses: tuple[Pose, Pose]
 
     @property
     def joint(self) -> tuple[int, int]:
@@ -102,10 +108,17 @@ class ComponentPair:
         beams = sum(max(0.0, each.beam_outlier_rate - MAPS_OUTLIER_RATE) for each in self.clutters)
         return Clutter(MAPS_OUTLIER_RATE + beams, 0.5 * sum(each.wall_outlier_rate for each in self.clutters))
 
+    def between_maps(self, pose: Pose) -> Pose:
+        """``first_T_second`` of the frames of the robots' maps, shape (3,).
+
+        :param pose: that of the first areas of both, shape (3,).
+        """
+        return se2.compose(se2.compose(self.poses[0], pose), se2.inverse(self.poses[1]))
+
     def as_one(self, hybrid_map: HybridMap) -> Component:
         """Both as one component, with another hybrid map, and the larger of the rates."""
         clutter = Clutter(*(max(rates) for rates in zip(*self.clutters, strict=True)))
-        return Component(hybrid_map, self.scans, clutter, self.log_repetition)
+        return Component(hybrid_map, self.scans, clutter, self.log_repetition, self.poses[0])
 
 
 def combine(first: Component, second: Component, shifts: Shift | None = None) -> ComponentPair:
@@ -125,9 +138,17 @@ def combine(first: Component, second: Component, shifts: Shift | None = None) ->
     combined.set_arc(areas[0], others[0], place, closure=False)
     combined.commit()
     scans = dict(first.scans) | {keyframe + keyframe_shift: scan for keyframe, scan in second.scans.items()}
-    clutters, log_repetition = (first.clutter, second.clutter), first.log_repetition + second.log_repetition
-    known, other = tuple(areas), tuple(others)
-    return ComponentPair(combined, scans, known, other, keyframe_shift, area_shift, clutters, log_repetition)
+    return ComponentPair(
+        combined,
+        scans,
+        known=tuple(areas),
+        other=tuple(others),
+        first_keyframe=keyframe_shift,
+        area_shift=area_shift,
+        clutters=(first.clutter, second.clutter),
+        log_repetition=first.log_repetition + second.log_repetition,
+        poses=(first.pose, second.pose),
+    )
 
 
 def renumber(hybrid_map: HybridMap, area_shift: int, keyframe_shift: int) -> HybridMap:

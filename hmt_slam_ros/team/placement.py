@@ -114,7 +114,7 @@ class PlacementPrior(NamedTuple):
 class Placement:
     """A way in which the second component may lie in the first.
 
-    :ivar pose: shape (3,), ``first_T_second``, of the frames of the components' first areas.
+    :ivar pose: shape (3,), ``first_T_second``, of the frames of the robots' maps.
     :ivar matches: {window: candidate} of those that agree, the best first.
     :ivar evidence: of all windows.
     :ivar probability: of the placement.

@@ -160,7 +160,8 @@ class PlacementSearch:
         comparison = PlaceComparison(pair, windows, geometry, self._configuration, self._map_search.grid_cache)
         found = placement_distribution(geometry, candidates, pair.joint, prior, comparison.log_ratio)
         self.comparison_work += comparison.work
-        return found
+        in_maps = [replace(each, pose=pair.between_maps(each.pose)) for each in found.placements]
+        return replace(found, placements=tuple(in_maps))
 
     def _candidates(self, number: int, window: Window | RendezvousWindow) -> list[WindowCandidate]:
         if isinstance(window, RendezvousWindow):

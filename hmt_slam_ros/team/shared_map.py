@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, HybridMap, KeyframePoses, has_foreign_keyframes
-from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
-from hmt_slam_ros.messages.map_changes import Arc
+from hmt_slam_ros.hybrid_map.shortest_path import connected_areas, shortest_path_beliefs
+from hmt_slam_ros.messages.map_changes import Arc, Pose
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.team import SharedArea, SharedItem, SharedScan, TeamUpdate
 from hmt_slam_ros.plain_data import to_plain
@@ -324,8 +324,9 @@ class ForeignMap:
         return scans, tuple(item for item in self._areas.values() if item.version > version)
 
     def component(self) -> Component:
-        """The map as a component: all that informative arcs join with its first area.
+        """The largest piece of the map that informative arcs hold together, as a component.
 
+        A robot that was kidnapped, or whose odometry failed, begins another piece.
         A keyframe that moved to another area may be in both until all has arrived: it is in the newer one.
         """
         hybrid_map, placed = HybridMap(), set[int]()
@@ -341,8 +342,24 @@ class ForeignMap:
                 if hybrid_map.has_area(arc.source) and hybrid_map.has_area(arc.target):
                     hybrid_map.changed_arcs[arc.source, arc.target] = ArcValue(arc.pose, arc.closure)
         hybrid_map.commit()
-        areas = hybrid_map.area_ids()
-        if areas:
-            hybrid_map = hybrid_map.subgraph(connected_areas(hybrid_map, areas[0]))
         scans = {keyframe: item.scan for keyframe, item in self._scans.items()}
-        return Component.of_map(hybrid_map, scans, self._clutter, self.log_repetition)
+        areas, pose = _largest_piece(hybrid_map)
+        found = Component.of_map(hybrid_map.subgraph(areas), scans, self._clutter, self.log_repetition)
+        return replace(found, pose=pose)
+
+
+def _largest_piece(hybrid_map: HybridMap) -> tuple[Collection[int], Pose]:
+    """The areas of the piece with the most keyframes, of equals the older one, and the pose of its first area.
+
+    Pieces without an arc to the first area, such as beyond an area that is still to come, have no pose.
+    """
+    areas = hybrid_map.area_ids()
+    if not areas:
+        return areas, np.zeros(3)
+    poses = {area: belief.mean for area, belief in shortest_path_beliefs(hybrid_map, areas[0]).items()}
+    pieces, left = list[list[int]](), set(poses)
+    while left:
+        pieces.append(sorted(connected_areas(hybrid_map, min(left))))
+        left.difference_update(pieces[-1])
+    largest = max(pieces, key=lambda piece: sum(len(hybrid_map.keyframes(area)) for area in piece))
+    return largest, poses[largest[0]]
