@@ -9,6 +9,9 @@ import pytest
 
 from hmt_slam_ros.configuration import Configuration, with_changes
 from hmt_slam_ros.geometry import se2
+from hmt_slam_ros.hybrid_map.pose_graph import consistent_poses
+from hmt_slam_ros.hybrid_map.shortest_path import map_pieces
+from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.team import (
     MAX_ROBOTS,
     JoinedGround,
@@ -334,3 +337,24 @@ def test_a_robot_goes_on_in_the_ground_of_another_one():
         assert set(numbers.keyframes.values()) == {k for k in together.replica.scans if k < 0}
     # What each shares is its own ground all the same.
     assert all(min(team._own.component().scans) >= 0 for team in run.teams.values())
+
+
+def test_a_robot_that_was_kidnapped_is_found_by_what_it_maps_afterwards():
+    """Its place in its own map is not known then, so that what it has from before is another piece."""
+    laps = {"ann": open_log(f"{OFFICE},laps=1"), "bob": open_log(f"{OFFICE},laps=1,visit=1,carried=0.1,to=0.5")}
+    placements = []
+    run = TeamRun(CONFIGURATION, laps, lambda _, each: placements.append(each))
+    run.run()
+    poses, truths = [], []
+    for name, log in laps.items():
+        replica = Replica.from_state(run.teams[name].state.replica)
+        hybrid_map = replica.maps[replica.best_hypothesis]
+        area = hybrid_map.area_ids()[-1]
+        keyframe, pose = next(iter(hybrid_map.keyframes(area).items()))
+        poses.append(se2.compose(consistent_poses(hybrid_map)[area], pose))
+        truths.append(log.true_poses(np.array([replica.scans[keyframe].stamp]))[0])
+    assert len(map_pieces(hybrid_map)) == 2
+    found = next(each for each in placements[::-1] if each.robot == "ann")
+    assert found.probability > 0.9
+    error = se2.between(se2.between(*truths), se2.between(poses[0], se2.compose(found.pose, poses[1])))
+    assert np.hypot(error[0], error[1]) < 0.3 and abs(error[2]) < 0.05

@@ -190,7 +190,7 @@ def test_of_a_map_in_pieces_the_largest_is_the_component():
     robot.map_keyframes(4, NEW_KEYFRAMES)
     receive(foreign, robot)
     assert_same(foreign, robot, [3, 4])
-    assert foreign.component().pose.tolist() == se2.compose([8.0, 0.0, 0.0], lost).tolist()
+    np.testing.assert_allclose(foreign.component().pose, se2.compose([8.0, 0.0, 0.0], lost), atol=1e-6)
     robot.join(2, 3)
     receive(foreign, robot)
     assert_same(foreign, robot, [0, 1, 2, 3, 4])

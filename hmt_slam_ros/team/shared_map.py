@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, HybridMap, KeyframePoses, has_foreign_keyframes
+from hmt_slam_ros.hybrid_map.pose_graph import consistent_poses
 from hmt_slam_ros.hybrid_map.shortest_path import connected_areas, shortest_path_beliefs
 from hmt_slam_ros.messages.map_changes import Arc, Pose
 from hmt_slam_ros.messages.replica import Replica
@@ -351,15 +352,16 @@ class ForeignMap:
 def _largest_piece(hybrid_map: HybridMap) -> tuple[Collection[int], Pose]:
     """The areas of the piece with the most keyframes, of equals the older one, and the pose of its first area.
 
-    Pieces without an arc to the first area, such as beyond an area that is still to come, have no pose.
+    A piece without an arc to the first one has no pose and does not count: areas between them are still to come.
     """
     areas = hybrid_map.area_ids()
     if not areas:
         return areas, np.zeros(3)
-    poses = {area: belief.mean for area, belief in shortest_path_beliefs(hybrid_map, areas[0]).items()}
-    pieces, left = list[list[int]](), set(poses)
+    pieces, left = list[list[int]](), set(shortest_path_beliefs(hybrid_map, areas[0]))
     while left:
         pieces.append(sorted(connected_areas(hybrid_map, min(left))))
         left.difference_update(pieces[-1])
     largest = max(pieces, key=lambda piece: sum(len(hybrid_map.keyframes(area)) for area in piece))
-    return largest, poses[largest[0]]
+    if largest is pieces[0]:
+        return largest, np.zeros(3)
+    return largest, consistent_poses(hybrid_map)[largest[0]]
