@@ -255,14 +255,20 @@ def map_pieces(hybrid_map: HybridMap) -> list[list[int]]:
 
     The place of one piece in another is unknown.
     """
-    pieces: list[list[int]] = []
-    for area in hybrid_map.area_ids():
-        if not any(area in piece for piece in pieces):
-            piece, reached = set[int](), [area]
-            while reached:
-                here = reached.pop()
-                if here not in piece:
-                    piece.add(here)
-                    reached += connected_neighbors(hybrid_map, here)
+    neighbors = {area: list[int]() for area in hybrid_map.area_ids()}
+    for a, b, arc in hybrid_map.all_arcs():
+        if not is_uninformative(arc.pose):
+            neighbors[a].append(b)
+            neighbors[b].append(a)
+    pieces, left = list[list[int]](), set(neighbors)
+    for area in neighbors:
+        piece, reached = list[int](), [area]
+        while reached:
+            here = reached.pop()
+            if here in left:
+                left.remove(here)
+                piece.append(here)
+                reached += neighbors[here]
+        if piece:
             pieces.append(sorted(piece))
     return pieces

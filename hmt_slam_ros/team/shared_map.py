@@ -21,7 +21,7 @@ import numpy as np
 
 from hmt_slam_ros.hybrid_map.hybrid_map import ArcValue, HybridMap, KeyframePoses, has_foreign_keyframes
 from hmt_slam_ros.hybrid_map.pose_graph import consistent_poses
-from hmt_slam_ros.hybrid_map.shortest_path import connected_areas, shortest_path_beliefs
+from hmt_slam_ros.hybrid_map.shortest_path import map_pieces, shortest_path_beliefs
 from hmt_slam_ros.messages.map_changes import Arc, Pose
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.team import SharedArea, SharedItem, SharedScan, TeamUpdate
@@ -357,10 +357,8 @@ def _largest_piece(hybrid_map: HybridMap) -> tuple[Collection[int], Pose]:
     areas = hybrid_map.area_ids()
     if not areas:
         return areas, np.zeros(3)
-    pieces, left = list[list[int]](), set(shortest_path_beliefs(hybrid_map, areas[0]))
-    while left:
-        pieces.append(sorted(connected_areas(hybrid_map, min(left))))
-        left.difference_update(pieces[-1])
+    reached = shortest_path_beliefs(hybrid_map, areas[0])
+    pieces = [piece for piece in map_pieces(hybrid_map) if piece[0] in reached]
     largest = max(pieces, key=lambda piece: sum(len(hybrid_map.keyframes(area)) for area in piece))
     if largest is pieces[0]:
         return largest, np.zeros(3)
