@@ -15,8 +15,9 @@ from hmt_slam_ros.saved_map.folder import FolderReader, FolderWriter
 from hmt_slam_ros.sensors.motion_model import Prediction
 from hmt_slam_ros.sensors.relative_motion import RelativeMotion, is_wide
 from hmt_slam_ros.submap.local_filter import ParticleFilterState, PlacedKeyframe
-from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan, ScanMatch, ScanMatcher
+from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.particle_filter import ParticleFilter
+from hmt_slam_ros.submap.scan_matcher import ScanMatch, ScanMatcher
 
 SURE = np.diag([0.02, 0.02, 0.01]) ** 2
 OVER_GAP = np.diag([0.4, 0.05, 0.05]) ** 2

@@ -47,7 +47,7 @@ from hmt_slam_ros.messages.messages import (
 from hmt_slam_ros.messages.replica import Replica, ReplicaState
 from hmt_slam_ros.sensors import Scan
 from hmt_slam_ros.sensors.relative_motion import is_wide
-from hmt_slam_ros.submap.local_mapping import exceeds_basin
+from hmt_slam_ros.submap.scan_matcher import exceeds_basin
 
 _NEAREST_KEYFRAMES = 8
 """Keyframes of an area, the nearest to a scan, whose overlap with it is measured."""

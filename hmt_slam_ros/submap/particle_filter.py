@@ -35,15 +35,9 @@ from hmt_slam_ros.submap.local_filter import (
     TrackedMode,
     TrackedMotion,
 )
-from hmt_slam_ros.submap.local_mapping import (
-    MOST_MODES,
-    LocalMapping,
-    PreparedScan,
-    ScanMatch,
-    ScanMatcher,
-    map_information,
-)
+from hmt_slam_ros.submap.local_mapping import LocalMapping, PreparedScan
 from hmt_slam_ros.submap.pose_modes import MotionMixture, PoseModes, log_sum, normalize_weights, share_out
+from hmt_slam_ros.submap.scan_matcher import MOST_MODES, ScanMatch, ScanMatcher, map_information
 
 
 class _TrackedGroup(NamedTuple):

@@ -19,7 +19,7 @@ from hmt_slam_ros.geometry.gaussian import rotate_covariance
 from hmt_slam_ros.registration.match_covariance import MatchError
 from hmt_slam_ros.sensors.relative_motion import NO_MOTION
 from hmt_slam_ros.submap.local_filter import TrackedMode
-from hmt_slam_ros.submap.local_mapping import coincide
+from hmt_slam_ros.submap.scan_matcher import coincide
 
 _UNMOVED = TrackedMode(NO_MOTION, NO_MOTION.covariance)
 """A mode after a filter step."""
