@@ -52,15 +52,15 @@ def match(windows, window, log_ratio, area=0, placement=TURNED, shift=(0.0, 0.0,
 
 
 FITS = WindowEvidence(5.0, True)
-UNIQUE = -50.0  # log Bayes factor of a building that repeats itself, nats
+UNIQUE = (-50.0, 0.0)  # log Bayes factors of a building that repeats itself, nats
 
 
 def no_contradictions(*_):
     return None
 
 
-def distribution(geometry, candidates, compare=no_contradictions, log_repetition=UNIQUE):
-    prior = PlacementPrior.of_pair(AREAS, WINDOWS, log_repetition)
+def distribution(geometry, candidates, compare=no_contradictions, log_repetitions=UNIQUE):
+    prior = PlacementPrior.of_pair(AREAS, WINDOWS, log_repetitions)
     return placement_distribution(geometry, candidates, (0, 10), prior, compare)
 
 
@@ -165,10 +165,25 @@ def test_contradictions_count_in_full():
 def test_a_building_that_repeats_itself_bounds_the_probability_of_a_placement():
     geometry, windows = two_rows()
     sure = [[match(windows, w, 50.0)] for w in range(WINDOWS)]
-    bounds = {r: distribution(geometry, sure, log_repetition=r).best.probability for r in (-1.0, 0.0, 5.0)}
+    bounds = {r: distribution(geometry, sure, log_repetitions=(r, 0.0)).best.probability for r in (-1.0, 0.0, 5.0)}
     assert bounds[-1.0] > bounds[0.0] == pytest.approx(1.0 / 1.003, abs=1e-4)
     odds_of_twins = 0.003 * math.exp(5.0)
     assert bounds[5.0] == pytest.approx(1.0 / (1.0 + odds_of_twins / (1.0 + odds_of_twins)), abs=1e-3)
+
+
+def test_common_ground_is_evidence_of_repetition_once():
+    geometry, windows = two_rows()
+    whole = [[match(windows, w, 50.0)] for w in range(WINDOWS)]
+
+    def sure(candidates, first, second):
+        return distribution(geometry, candidates, log_repetitions=(first, second)).best
+
+    assert sure(whole, 2.0, 3.0).common == 1.0
+    assert sure(whole, 2.0, 3.0).probability == sure(whole, 2.0, 0.0).probability
+    # A window beyond the ground of the first is evidence of its own.
+    part = [*whole[:2], []]
+    assert sure(part, 2.0, 3.0).common == pytest.approx(2.0 / 3.0)
+    assert sure(part, 2.0, 3.0).probability == pytest.approx(sure(part, 3.0, 0.0).probability)
 
 
 def test_before_much_is_mapped_common_ground_is_improbable():

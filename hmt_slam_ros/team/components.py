@@ -80,7 +80,7 @@ class ComponentPair:
     :ivar first_keyframe: number from which on keyframes are those of the second.
     :ivar area_shift: added to the numbers of the second's areas.
     :ivar clutters: usual rates of contradictions of the first and of the second.
-    :ivar log_repetition: log Bayes factor of a building that repeats itself, from both maps, nats.
+    :ivar log_repetitions: log Bayes factors of a building that repeats itself, from the first map and the second, nats.
     :ivar poses: of the first areas of both in the frames of the robots' maps, each of shape (3,).
     """
 
@@ -91,7 +91,7 @@ class ComponentPair:
     first_keyframe: int
     area_shift: int
     clutters: tuple[Clutter, Clutter]
-    log_repetition: float
+    log_repetitions: tuple[float, float]
     poses: tuple[Pose, Pose]
 
     @property
@@ -118,7 +118,7 @@ class ComponentPair:
     def as_one(self, hybrid_map: HybridMap) -> Component:
         """Both as one component, with another hybrid map, and the larger of the rates."""
         clutter = Clutter(*(max(rates) for rates in zip(*self.clutters, strict=True)))
-        return Component(hybrid_map, self.scans, clutter, self.log_repetition, self.poses[0])
+        return Component(hybrid_map, self.scans, clutter, pose=self.poses[0])
 
 
 def combine(first: Component, second: Component, shifts: Shift | None = None) -> ComponentPair:
@@ -146,7 +146,7 @@ def combine(first: Component, second: Component, shifts: Shift | None = None) ->
         first_keyframe=keyframe_shift,
         area_shift=area_shift,
         clutters=(first.clutter, second.clutter),
-        log_repetition=first.log_repetition + second.log_repetition,
+        log_repetitions=(first.log_repetition, second.log_repetition),
         poses=(first.pose, second.pose),
     )
 

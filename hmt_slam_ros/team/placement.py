@@ -5,13 +5,14 @@ Candidates of several windows that imply the same one, as far as the arcs betwee
 
     log P(H) = log prior + l_best + S(H) - max(0, S_2)
 
-    log P(apart) = log(prior + beta sum over H of P(H))
+    log P(apart) = log(prior + sum over H of beta(H) P(H))
 
 with l the log Bayes factor of a window, relative to ground that the first component does not have, and S(H) the
 evidence of the other windows (:mod:`hmt_slam_ros.team.placement_evidence`). Of two placements one at least is false:
 the second largest S shows how far false ones agree in this building, and is no evidence
 (docs/decisions/0070-joining-two-maps.md). beta is the probability of a building that repeats itself, so that what looks
-like the first component's ground may be its twin (:mod:`hmt_slam_ros.team.repetition`).
+like the first component's ground may be its twin (:mod:`hmt_slam_ros.team.repetition`). Of ground that both have, one
+map alone is evidence of that (docs/decisions/0095-repetition-of-common-ground.md).
 """
 
 from __future__ import annotations
@@ -92,22 +93,33 @@ class PlacementPrior(NamedTuple):
     """What is known of placements before any window was compared.
 
     :ivar places: number of areas of the building, in each of which the second component may begin.
-    :ivar twin: probability of a building that repeats itself, so that ground of the first component has a twin.
+    :ivar log_repetitions: log Bayes factors of a building that repeats itself, from the first component and from the
+        second, nats.
     """
 
     places: int
-    twin: float
+    log_repetitions: tuple[float, float]
 
     @classmethod
-    def of_pair(cls, known_areas: int, other_areas: int, log_repetition: float = 0.0) -> PlacementPrior:
+    def of_pair(
+        cls, known_areas: int, other_areas: int, log_repetitions: tuple[float, float] = (0.0, 0.0)
+    ) -> PlacementPrior:
         """The prior that is flat over a building that is as large as both components together, and unseen areas.
 
         :param known_areas: number of areas of the first component.
         :param other_areas: number of areas of the second.
-        :param log_repetition: log Bayes factor of a building that repeats itself, nats.
+        :param log_repetitions: log Bayes factors of a building that repeats itself, from either component, nats.
         """
-        odds = _REPETITION_PRIOR * math.exp(log_repetition)
-        return cls(known_areas + other_areas + _UNSEEN_AREAS, odds / (1.0 + odds))
+        return cls(known_areas + other_areas + _UNSEEN_AREAS, log_repetitions)
+
+    def twin_probability(self, common: float) -> float:
+        """Probability of a building that repeats itself, so that ground of the first component has a twin.
+
+        :param common: share of the second component that is in the first one's ground: the same evidence, not more.
+        """
+        first, second = self.log_repetitions
+        odds = _REPETITION_PRIOR * math.exp(first + (1.0 - common) * second)
+        return odds / (1.0 + odds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,12 +129,14 @@ class Placement:
     :ivar pose: shape (3,), ``first_T_second``, of the frames of the robots' maps.
     :ivar matches: {window: candidate} of those that agree, the best first.
     :ivar evidence: of all windows.
+    :ivar common: share of the windows that it has in ground of the first component.
     :ivar probability: of the placement.
     """
 
     pose: Pose
     matches: Mapping[int, WindowCandidate]
     evidence: PlacementEvidence
+    common: float
     probability: float = 0.0
 
 
@@ -267,7 +281,8 @@ def placement_distribution(
         matches = {w: each.matches[w] for w in sorted(each.matches, key=lambda w: (-own[w].log_ratio, w))}
         pose = geometry.component_pose(*joint, next(iter(matches.values())))
         similar = similar_probability(windows[:n] + windows[n + 1 :])
-        placements.append(Placement(pose, matches, placement_evidence(own, similar)))
+        common = sum(window.is_in_place for window in own.values()) / len(own)
+        placements.append(Placement(pose, matches, placement_evidence(own, similar), common))
     return weigh_placements(placements, prior)
 
 
@@ -279,7 +294,8 @@ def weigh_placements(placements: Sequence[Placement], prior: PlacementPrior) -> 
     share = (1.0 - APART_PRIOR) / prior.places
     false_agreement = sorted([0.0, 0.0, *(each.evidence.agreement for each in placements)])[-2]
     logs = np.array([math.log(share) + sum(each.evidence) - false_agreement for each in placements])
-    apart = np.append(logs + math.log(prior.twin), math.log(max(APART_PRIOR, 1.0 - share * len(placements))))
+    log_twins = np.log([prior.twin_probability(each.common) for each in placements])
+    apart = np.append(logs + log_twins, math.log(max(APART_PRIOR, 1.0 - share * len(placements))))
     weights = scipy.special.softmax(np.append(logs, scipy.special.logsumexp(apart))).tolist()
     weighed = [replace(each, probability=p) for each, p in zip(placements, weights[:-1], strict=True)]
     return PlacementDistribution(tuple(sorted(weighed, key=lambda each: -each.probability)), weights[-1])
