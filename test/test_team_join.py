@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from laps import CONFIGURATION, map_lap
-from worlds import box, scan_at
+from worlds import box, drive, scan_at
 
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
@@ -147,6 +147,24 @@ def test_the_pose_of_a_placement_is_between_the_frames_of_the_maps():
         assert now.probability == before.probability
         expected = se2.compose(se2.compose(one, before.pose), se2.inverse(other))
         assert now.pose.tolist() == expected.tolist()
+
+
+def hall(y, seed):
+    """The map of a straight way through a hall of 10 m by 7 m, ``y`` m from its wall."""
+    walls = np.concatenate((box(0.0, 0.0, 10.0, 7.0), box(3.0, 0.0, 4.5, 0.6), box(7.0, 6.0, 7.8, 7.0)))
+    hybrid_map, rng = HybridMap(), np.random.default_rng(seed)
+    poses = dict(enumerate(drive((1.0, y), (9.0, y))))
+    for keyframe, pose in poses.items():
+        hybrid_map.set_keyframe(keyframe, 0, se2.between(poses[0], pose))
+    hybrid_map.commit()
+    return Component(hybrid_map, {k: scan_at(walls, pose, 0.01, rng, 360) for k, pose in poses.items()})
+
+
+@pytest.mark.parametrize("y", [1.5, 5.0])
+def test_a_robot_on_the_other_side_of_a_hall_is_found(y):
+    found = meet(hall(1.5, 0), hall(y, 1), CONFIGURATION).distribution.best
+    np.testing.assert_allclose(found.pose, [0.0, y - 1.5, 0.0], atol=0.05)
+    assert found.common == 1.0
 
 
 def matched_at(shift):

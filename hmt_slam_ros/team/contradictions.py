@@ -24,7 +24,7 @@ from hmt_slam_ros.registration.consistency import MAP_IN_MAP
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 from hmt_slam_ros.team.components import ComponentPair
 from hmt_slam_ros.team.placement import PlacementGeometry
-from hmt_slam_ros.team.windows import Window
+from hmt_slam_ros.team.windows import GROUND_RADIUS, Window
 from hmt_slam_ros.topological_inference.place_recognition import MIN_LOG_RATIO
 
 _MAX_SIGMA = 2.0
@@ -56,11 +56,9 @@ class PlaceComparison:
         grid_cache: GridCache,
     ) -> None:
         """:param grid_cache: of the scans of both components."""
-        options = configuration.tsbi
         self._pair, self._windows, self._geometry = pair, windows, geometry
         self._grid_cache = grid_cache
-        self._settings = replace(MatchSettings.from_options(options), min_log_ratio=MIN_LOG_RATIO)
-        self._radius = options.place_radius
+        self._settings = replace(MatchSettings.from_options(configuration.tsbi), min_log_ratio=MIN_LOG_RATIO)
         self._outlier_rate = pair.clutter.beam_outlier_rate
         self.work = 0
         known = [(geometry.map_pose(area, np.zeros(3))[:2], _extent(pair, area)) for area in pair.known]
@@ -82,7 +80,7 @@ class PlaceComparison:
         if nearest is None:
             return None
         place = self._grid_cache.place(self._pair.hybrid_map, nearest, (), self._pair.first_keyframe)
-        if containing_area(place, se2.compose(there.mean, stack_poses(poses)), self._radius) is None:
+        if containing_area(place, se2.compose(there.mean, stack_poses(poses)), GROUND_RADIUS) is None:
             return None
         self.work += _WINDOW_WORK
         query = self._grid_cache.grid(poses)
@@ -105,7 +103,7 @@ class PlaceComparison:
             for other in self._areas_around(area, belief, positions)
         }
         nearest = min(distances, key=lambda other: (distances[other], other), default=None)
-        if nearest is None or distances[nearest] > self._radius:
+        if nearest is None or distances[nearest] > GROUND_RADIUS:
             return None, belief
         return nearest, self._geometry.paths(nearest)[area].compose(belief)
 
@@ -114,7 +112,7 @@ class PlaceComparison:
         extent = float(np.hypot(*(positions - belief.mean[:2]).T).max())
         center = self._geometry.map_pose(area, belief.mean)[:2]
         distances = np.hypot(*(self._centers - center).T)
-        near = distances <= self._extents + extent + self._radius + _MAX_DRIFT
+        near = distances <= self._extents + extent + GROUND_RADIUS + _MAX_DRIFT
         return [self._pair.known[n] for n in np.flatnonzero(near)]
 
     def _match(self, query: AreaGrid, place: AreaPlace, belief: PoseGaussian) -> Float64:

@@ -18,7 +18,7 @@ from hmt_slam_ros.team.placement import (
     window_candidates,
 )
 from hmt_slam_ros.team.rendezvous import Rendezvous, RendezvousWindow, rendezvous_window
-from hmt_slam_ros.team.windows import Window, find_windows
+from hmt_slam_ros.team.windows import GROUND_RADIUS, Window, find_windows
 from hmt_slam_ros.topological_inference.event_work import EventWork
 from hmt_slam_ros.topological_inference.global_localization import GlobalSearch
 from hmt_slam_ros.topological_inference.map_search import MapSearch
@@ -67,7 +67,7 @@ class PlacementSearch:
         self._configuration, self._exclusion = configuration, exclusion
         self._scans: dict[int, Scan] = {}
         self._work = EventWork()
-        self._map_search = MapSearch(configuration, self._scans, self._work)
+        self._map_search = MapSearch(configuration, self._scans, self._work, GROUND_RADIUS)
         self._pair: ComponentPair | None = None
         self._windows: list[Window] = []
         self._in_order: list[Window | RendezvousWindow] = []

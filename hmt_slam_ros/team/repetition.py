@@ -25,11 +25,13 @@ from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions, stack_poses
 from hmt_slam_ros.messages.team import MAX_LOG_REPETITION
 from hmt_slam_ros.team.components import Component, ComponentPair, Shift, combine
 from hmt_slam_ros.team.placement_search import PlacementSearch
-from hmt_slam_ros.team.windows import MAX_LENGTH, Window
+from hmt_slam_ros.team.windows import GROUND_RADIUS, Window
 
 _BEYOND = 0.5
 """Probability that the twin of mapped ground, if there is one, is not mapped itself."""
 
+_MIN_SHIFT = 6.0
+"""Least distance of a window from its own copy, m: nearer, it shows the same ground."""
 
 _DIGITS = 2
 """Decimal digits of a log Bayes factor: others are nothing new."""
@@ -89,7 +91,7 @@ class _OverlappingAreas:
         pose = self._poses[window.area - self._shift].mean
         positions = se2.compose(se2.compose(pose, window.reference), stack_poses(window.poses))[:, :2]
         distances = np.hypot(*(self._positions[:, None] - positions).transpose(2, 0, 1)).min(axis=1)
-        return frozenset(np.unique(self._areas[distances <= MAX_LENGTH]).tolist())
+        return frozenset(np.unique(self._areas[distances <= GROUND_RADIUS + _MIN_SHIFT]).tolist())
 
 
 def _log_ratio(search: PlacementSearch) -> float:

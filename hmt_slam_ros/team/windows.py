@@ -14,8 +14,14 @@ from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 
 Pose = Float64
 
-MAX_LENGTH = 8.0
+_MAX_LENGTH = 8.0
 """Length of the path in a window, m: with more the map may bend, with less places look alike."""
+
+GROUND_RADIUS = 4.0
+"""Distance from a keyframe in sight within which another component's window is on its ground, m.
+
+Robots keep to different sides of a hall (docs/decisions/0096-sides-of-a-hall.md).
+"""
 
 _MAX_KEYFRAMES = 20
 """Most keyframes of a window."""
@@ -100,7 +106,7 @@ def _window_from(hybrid_map: HybridMap, keyframes: Sequence[tuple[int, int]]) ->
             break
         pose = se2.between(start, se2.compose(frames[own].mean, hybrid_map.keyframes(own)[keyframe]))
         step = float(np.hypot(*(pose - last)[:2]))
-        if step > _MAX_STEP or length + step > MAX_LENGTH:
+        if step > _MAX_STEP or length + step > _MAX_LENGTH:
             break
         poses[keyframe] = pose
         last, length = pose, length + step

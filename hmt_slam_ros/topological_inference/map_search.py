@@ -38,9 +38,18 @@ class MapSearch:
     :ivar grid_cache: grids of the whole map.
     """
 
-    def __init__(self, configuration: Configuration, scans: Mapping[int, Scan], work: EventWork) -> None:
-        """:param scans: {keyframe: scan}, which may grow."""
+    def __init__(
+        self,
+        configuration: Configuration,
+        scans: Mapping[int, Scan],
+        work: EventWork,
+        place_radius: float | None = None,
+    ) -> None:
+        """:param scans: {keyframe: scan}, which may grow.
+        :param place_radius: largest distance to a keyframe of an area's place, m; ``tsbi.place_radius`` if None.
+        """
         self._options = options = configuration.tsbi
+        self._place_radius = options.place_radius if place_radius is None else place_radius
         self.work = work
         self._descriptors = ScanDescriptors(scans)
         radius = Neighborhood(options.local_sigma, options.local_reach)
@@ -50,7 +59,7 @@ class MapSearch:
             self.grid_cache,
             FreeSpaceCheck(scans, configuration),
             MatchSettings.from_options(options),
-            options.place_radius,
+            self._place_radius,
             options.local_reach,
         )
 
@@ -89,7 +98,7 @@ class MapSearch:
         known = {area: [k for k in hybrid_map.keyframes(area) if k < before] for area in hybrid_map.area_ids()}
         known = {area: keyframes for area, keyframes in known.items() if keyframes}
         probabilities = self._descriptors.area_probabilities(list(poses), known)
-        return begin_search(hybrid_map, poses, before, probabilities, prior, self._options.place_radius, only)
+        return begin_search(hybrid_map, poses, before, probabilities, prior, self._place_radius, only)
 
     def continue_search(
         self, hybrid_map: HybridMap, search: GlobalSearch, first: int | None = None, prior: SearchPrior = FLAT_PRIOR
