@@ -20,7 +20,7 @@ from hmt_slam_ros.hybrid_map.surroundings import (
     stack_poses,
 )
 from hmt_slam_ros.registration.area_to_area import MatchSettings, best_pose
-from hmt_slam_ros.registration.consistency import MAP_IN_MAP
+from hmt_slam_ros.registration.consistency import MAP_IN_MAP, Agreement
 from hmt_slam_ros.registration.likelihood_grid import AreaGrid
 from hmt_slam_ros.team.components import ComponentPair
 from hmt_slam_ros.team.placement import PlacementGeometry
@@ -68,8 +68,9 @@ class PlaceComparison:
     def log_ratio(self, window: int, area: int, belief: PoseGaussian, is_matched: bool) -> float | None:
         """Log Bayes factor of the contradictions of a window, nats, at most 0; None where it lies in no place.
 
-        Surfaces of either side in the free space of the other contradict. Those of a window that was matched count in
-        one direction, since the match has the other one.
+        Surfaces of either side in the free space of the other contradict, at the best match within the belief: the arcs
+        to the place leave some decimeters open, also of a match with a map around another area. Those of a window that
+        was matched count in one direction, since the match has the other one.
 
         :param area: in which ``belief`` is over ``area_T_reference``.
         """
@@ -84,11 +85,11 @@ class PlaceComparison:
             return None
         self.work += _WINDOW_WORK
         query = self._grid_cache.grid(poses)
-        if is_matched:
-            return min(0.0, self._seen_from(query, place, there.mean))
         pose = self._match(query, place, there)
-        forward = MAP_IN_MAP.log_likelihood_ratio(place.grid.compare(query.points, pose), self._outlier_rate)
-        return min(0.0, forward + self._seen_from(query, place, pose))
+        against = self._log_ratio(query.compare(place.grid.points, se2.inverse(pose)))
+        if not is_matched:
+            against += self._log_ratio(place.grid.compare(query.points, pose))
+        return min(0.0, against)
 
     def _nearest_area(
         self, area: int, belief: PoseGaussian, poses: Mapping[int, Float64]
@@ -121,10 +122,8 @@ class PlaceComparison:
         found, _ = best_pose(query, place.grid, prior, self._settings)
         return belief.mean if found is None else found[0]
 
-    def _seen_from(self, query: AreaGrid, place: AreaPlace, pose: Float64) -> float:
-        """Log Bayes factor of the place's surfaces in what the window saw, nats."""
-        agreement = query.compare(place.grid.points, se2.inverse(pose))
-        return MAP_IN_MAP.log_likelihood_ratio(agreement, self._outlier_rate)
+    def _log_ratio(self, found: Agreement) -> float:
+        return MAP_IN_MAP.log_likelihood_ratio(found, self._outlier_rate)
 
 
 def _extent(pair: ComponentPair, area: int) -> float:
