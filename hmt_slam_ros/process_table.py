@@ -215,7 +215,7 @@ DOCUMENTS: tuple[DocumentRow, ...] = (
     DocumentRow("hmt_slam_ros.messages.alternatives:Alternatives", "hmt/alternatives", "alternatives", 1),
     DocumentRow("hmt_slam_ros.messages.evidence:Evidence", "hmt/evidence", "evidence", 1),
     DocumentRow(f"{_TEAM}:JoinedGround", "hmt/joined_ground", "joined_ground", 1),
-    DocumentRow(f"{_TEAM}:TeamStatus", "/team/statuses", "team_status", 2),
+    DocumentRow(f"{_TEAM}:TeamStatus", "/team/statuses", "team_status", 3),
     DocumentRow(f"{_TEAM}:TeamRequest", "/team/requests", "team_request", 1),
     DocumentRow(f"{_TEAM}:TeamUpdate", "/team/updates", "team_update", 2),
     DocumentRow(f"{_TEAM}:TeamPlacement", "/team/placements", "team_placement", 1),

@@ -19,6 +19,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.messages.documents import decode, encode
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.team import (
+    NO_REPETITION,
     SharedArea,
     TeamPlacement,
     TeamRequest,
@@ -196,9 +197,9 @@ def test_what_is_no_message_of_a_team_is_refused_by_name(team, listener):
     area = SharedArea(1, 0, (0, 0), (np.zeros(3), np.zeros(3)), ())
     strange = {
         TeamStatus: [
-            encode(TeamStatus("bob", "another", 1, "0", 0.0)),
+            encode(TeamStatus("bob", "another", 1, "0", NO_REPETITION)),
             "{}",
-            encode(TeamStatus("", "1", 1, "0", 0.0)),
+            encode(TeamStatus("", "1", 1, "0", NO_REPETITION)),
         ],
         TeamRequest: [encode(TeamRequest("ann", "bob", "1", 0)).replace('"version":1', '"version":7')],
         TeamUpdate: [

@@ -83,7 +83,7 @@ def test_maps_of_two_buildings_stay_apart():
 
 def test_of_a_ring_with_equal_sides_four_placements_keep_their_probabilities():
     found = meeting((RING, 0), (RING, 1))
-    assert min(found.pair.log_repetitions) > 2.5
+    assert min(found.pair.repetitions).log_ratio > 2.5
     probabilities = [each.probability for each in found.distribution.placements]
     assert min(probabilities[:4]) > 0.5 * probabilities[0]
     assert max(probabilities[4:], default=0.0) < 0.01 * probabilities[0]
@@ -106,20 +106,20 @@ def test_a_third_map_joins_the_piece_that_it_fits():
             assert whole.component.scans[keyframe + shift.keyframes] is scan
 
 
-def room(x, seed):
+def room(x, seed, cupboard=5.0):
     """Keyframes of a walk through a room of 8 m by 6 m with a cupboard, which stands at ``x``, and their scans."""
-    walls = np.concatenate((box(0.0, 0.0, 8.0, 6.0), box(5.0, 4.5, 7.0, 5.5)))
+    walls = np.concatenate((box(0.0, 0.0, 8.0, 6.0), box(cupboard, 4.5, cupboard + 2.0, 5.5)))
     walls[:, ::2] += x
     rng = np.random.default_rng(seed)
     poses = [np.array([x + 1.0 + 0.5 * n, 1.5 + 0.3 * (n % 3), 0.4 * n]) for n in range(12)]
     return poses, [scan_at(walls, pose, 0.01, rng, 360) for pose in poses]
 
 
-def rooms(places, seed):
-    """The map of equal rooms, one area in each."""
+def rooms(places, seed, cupboards=()):
+    """The map of rooms, one area in each, equal but for where their cupboards stand."""
     hybrid_map, scans = HybridMap(), {}
     for area, x in enumerate(places):
-        for pose, scan in zip(*room(x, seed + area), strict=True):
+        for pose, scan in zip(*room(x, seed + area, *cupboards[area : area + 1]), strict=True):
             hybrid_map.set_keyframe(len(scans), area, pose - [x, 0.0, 0.0])
             scans[len(scans)] = scan
         if area:
@@ -164,7 +164,7 @@ def hall(y, seed):
 def test_a_robot_on_the_other_side_of_a_hall_is_found(y):
     found = meet(hall(1.5, 0), hall(y, 1), CONFIGURATION).distribution.best
     np.testing.assert_allclose(found.pose, [0.0, y - 1.5, 0.0], atol=0.05)
-    assert found.common == 1.0
+    assert all(window.is_in_place for window in found.windows.values())
 
 
 def matched_at(shift):
@@ -173,7 +173,7 @@ def matched_at(shift):
     windows = [Window(area, np.zeros(3), pair.hybrid_map.keyframes(area)) for area in pair.other]
     beliefs = [PoseGaussian(np.array([x, 0.0, 0.0]), TIGHT) for x in (0.0, shift)]
     matches = {n: WindowCandidate(n, area, beliefs[n], 5.0) for n, area in enumerate(pair.known)}
-    return pair, windows, Placement(np.zeros(3), matches, PlacementEvidence(5.0, 5.0), common=1.0, probability=0.999)
+    return pair, windows, Placement(np.zeros(3), matches, {}, PlacementEvidence(5.0, 5.0), 0.999)
 
 
 @pytest.mark.parametrize(("shift", "verdict"), [(0.02, Verdict.JOINED), (0.5, Verdict.CONTRADICTORY)])

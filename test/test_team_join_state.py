@@ -19,7 +19,7 @@ PLACE, TWIN = np.array([20.0, 1.0, 3.0]), np.array([11.0, 1.0, 3.0])
 
 def meeting(verdict, probability, pose=PLACE):
     """A comparison whose best placement has that pose; the maps themselves are not needed."""
-    placement = Placement(pose, {}, PlacementEvidence(5.0, 5.0), common=1.0, probability=probability)
+    placement = Placement(pose, {}, {}, PlacementEvidence(5.0, 5.0), probability)
     return Meeting(None, (), PlacementDistribution((placement,), 1.0 - probability), verdict)
 
 

@@ -9,6 +9,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
+from hmt_slam_ros.messages.team import NO_REPETITION, Repetition
 from hmt_slam_ros.registration.area_to_area import MatchMode
 from hmt_slam_ros.registration.consistency import Agreement
 from hmt_slam_ros.team.placement import (
@@ -52,15 +53,15 @@ def match(windows, window, log_ratio, area=0, placement=TURNED, shift=(0.0, 0.0,
 
 
 FITS = WindowEvidence(5.0, True)
-UNIQUE = (-50.0, 0.0)  # log Bayes factors of a building that repeats itself, nats
+UNIQUE = Repetition(-50.0, 1.0), NO_REPETITION
 
 
 def no_contradictions(*_):
     return None
 
 
-def distribution(geometry, candidates, compare=no_contradictions, log_repetitions=UNIQUE):
-    prior = PlacementPrior.of_pair(AREAS, WINDOWS, log_repetitions)
+def distribution(geometry, candidates, compare=no_contradictions, repetitions=UNIQUE):
+    prior = PlacementPrior.of_pair(AREAS, WINDOWS, repetitions)
     return placement_distribution(geometry, candidates, (0, 10), prior, compare)
 
 
@@ -165,7 +166,10 @@ def test_contradictions_count_in_full():
 def test_a_building_that_repeats_itself_bounds_the_probability_of_a_placement():
     geometry, windows = two_rows()
     sure = [[match(windows, w, 50.0)] for w in range(WINDOWS)]
-    bounds = {r: distribution(geometry, sure, log_repetitions=(r, 0.0)).best.probability for r in (-1.0, 0.0, 5.0)}
+    bounds = {
+        r: distribution(geometry, sure, repetitions=(Repetition(r, 1.0), NO_REPETITION)).best.probability
+        for r in (-1.0, 0.0, 5.0)
+    }
     assert bounds[-1.0] > bounds[0.0] == pytest.approx(1.0 / 1.003, abs=1e-4)
     odds_of_twins = 0.003 * math.exp(5.0)
     assert bounds[5.0] == pytest.approx(1.0 / (1.0 + odds_of_twins / (1.0 + odds_of_twins)), abs=1e-3)
@@ -176,14 +180,34 @@ def test_common_ground_is_evidence_of_repetition_once():
     whole = [[match(windows, w, 50.0)] for w in range(WINDOWS)]
 
     def sure(candidates, first, second):
-        return distribution(geometry, candidates, log_repetitions=(first, second)).best
+        repetitions = Repetition(first, 1.0), Repetition(second, 1.0)
+        return distribution(geometry, candidates, repetitions=repetitions).best.probability
 
-    assert sure(whole, 2.0, 3.0).common == 1.0
-    assert sure(whole, 2.0, 3.0).probability == sure(whole, 2.0, 0.0).probability
+    assert sure(whole, 4.0, 3.0) == sure(whole, 4.0, 0.0)
     # A window beyond the ground of the first is evidence of its own.
     part = [*whole[:2], []]
-    assert sure(part, 2.0, 3.0).common == pytest.approx(2.0 / 3.0)
-    assert sure(part, 2.0, 3.0).probability == pytest.approx(sure(part, 3.0, 0.0).probability)
+    assert sure(part, 4.0, 3.0) == pytest.approx(sure(part, 5.0, 0.0))
+
+
+def test_a_twin_that_ends_in_the_map_does_not_explain_common_ground_that_goes_on():
+    geometry, windows = two_rows()
+
+    def sure(count, persistence):
+        candidates = [[match(windows, w, 50.0)] if w < count else [] for w in range(WINDOWS)]
+        repetitions = Repetition(20.0, persistence), Repetition(0.0, 1.0)
+        return distribution(geometry, candidates, repetitions=repetitions).best.probability
+
+    assert sure(3, 1.0) == pytest.approx(0.5, abs=1e-3)
+    assert sure(3, 0.5) == pytest.approx(1.0 / (1.0 + 0.5**2), abs=1e-3)
+    assert sure(1, 0.5) == pytest.approx(0.5, abs=1e-3)
+
+
+def test_a_twin_that_neither_map_has_may_be_as_large_as_the_building():
+    geometry, windows = two_rows()
+    sure = [[match(windows, w, 50.0)] for w in range(WINDOWS)]
+    repetitions = Repetition(20.0, 1e-9), Repetition(0.0, 1.0)
+    bounded = distribution(geometry, sure, repetitions=repetitions).best.probability
+    assert 1.0 - bounded == pytest.approx(0.003 * 0.5, rel=0.01)
 
 
 def test_before_much_is_mapped_common_ground_is_improbable():

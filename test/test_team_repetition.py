@@ -7,14 +7,19 @@ import pytest
 from laps import CONFIGURATION, map_lap
 from test_team_join import rooms
 
+from hmt_slam_ros.messages.team import Repetition
 from hmt_slam_ros.team.components import Shift, combine
 from hmt_slam_ros.team.repetition import RepetitionTest, add_repetition
 
 OFFICE, RING = "sim:office,size=0.7,seed=51", "sim:ring,seed=50"
 
 
+def repetition(component):
+    return add_repetition(component, CONFIGURATION).repetition
+
+
 def log_repetition(component):
-    return add_repetition(component, CONFIGURATION).log_repetition
+    return repetition(component).log_ratio
 
 
 def test_an_office_does_not_repeat_itself():
@@ -23,7 +28,16 @@ def test_an_office_does_not_repeat_itself():
 
 
 def test_a_ring_with_equal_sides_repeats_itself():
-    assert log_repetition(map_lap(RING, 0)) > 5.0
+    found = repetition(map_lap(RING, 0))
+    assert found.log_ratio > 5.0
+    # Nowhere it was seen to end.
+    assert found.persistence == 1.0
+
+
+def test_where_what_is_alike_ends_it_is_less_persistent():
+    """Three rooms, of which the third has another shape: the shift by one room ends there."""
+    assert repetition(rooms((0.0, 30.0, 60.0), 0)).persistence == 1.0
+    assert 0.5 < repetition(rooms((0.0, 30.0, 60.0), 0, cupboards=(5.0, 5.0, 1.0))).persistence < 0.95
 
 
 def test_of_two_equal_rooms_one_is_the_twin_of_the_other():
@@ -45,9 +59,10 @@ def test_a_map_that_grows_ends_as_if_it_had_been_tested_whole():
         test.update(part, Shift(1000, 10_000))
         while not test.is_done:
             test.step()
-    assert test.log_ratio == pytest.approx(log_repetition(component), abs=0.011)
+    assert test.repetition == pytest.approx(repetition(component), abs=0.011)
 
 
 def test_a_pair_has_the_evidence_of_both_maps():
-    one, other = (replace(rooms((0.0,), seed), log_repetition=own) for seed, own in ((0, 1.5), (5, -0.5)))
-    assert combine(one, other).log_repetitions == (1.5, -0.5)
+    own = Repetition(1.5, 0.8), Repetition(-0.5, 1.0)
+    one, other = (replace(rooms((0.0,), 5 * n), repetition=own[n]) for n in range(2))
+    assert combine(one, other).repetitions == own

@@ -14,7 +14,9 @@ from hmt_slam_ros.hybrid_map.shortest_path import map_pieces
 from hmt_slam_ros.messages.replica import Replica
 from hmt_slam_ros.messages.team import (
     MAX_ROBOTS,
+    NO_REPETITION,
     JoinedGround,
+    Repetition,
     TeamPlacement,
     TeamRequest,
     TeamStatus,
@@ -175,21 +177,23 @@ def test_lost_and_repeated_messages_change_nothing_in_the_end(monkeypatch):
 def test_another_session_of_a_robot_is_another_map():
     network = Network()
     network.pass_messages()
-    assert network.new.handle(TeamStatus("ann", "later", 3, "0", 0.0)) == [TeamRequest("zoe", "ann", "later", 0)]
+    assert network.new.handle(TeamStatus("ann", "later", 3, "0", NO_REPETITION)) == [
+        TeamRequest("zoe", "ann", "later", 0)
+    ]
     assert not component(network.new, "ann").scans
 
 
 def test_a_status_with_another_repetition_does_not_show_that_an_update_was_lost():
-    team, status = Team(CONFIGURATION, TeamState("zoe", "s")), TeamStatus("ann", "s", 3, "0", 0.0)
+    team, status = Team(CONFIGURATION, TeamState("zoe", "s")), TeamStatus("ann", "s", 3, "0", NO_REPETITION)
     assert team.handle(status) == [TeamRequest("zoe", "ann", "s", 0)]
-    assert team.handle(replace(status, log_repetition=-0.1)) == []
-    assert team.handle(replace(status, log_repetition=-0.1)) == [TeamRequest("zoe", "ann", "s", 0)]
+    assert team.handle(replace(status, repetition=Repetition(-0.1, 1.0))) == []
+    assert team.handle(replace(status, repetition=Repetition(-0.1, 1.0))) == [TeamRequest("zoe", "ann", "s", 0)]
 
 
 def test_a_map_of_another_session_is_joined_with_nothing():
     team = deepcopy(office_run()[0].teams["bob"])
     assert team.map_poses.keys() == {"ann", "bob"}
-    team.handle(TeamStatus("ann", "later", 0, "0", 0.0))
+    team.handle(TeamStatus("ann", "later", 0, "0", NO_REPETITION))
     assert team.map_poses.keys() == {"bob"}
 
 
@@ -250,7 +254,7 @@ def test_updates_of_unknown_robots_and_the_own_status_do_nothing():
 
 def test_the_number_of_robots_is_bounded():
     team = Team(CONFIGURATION, TeamState("ann", "s"))
-    answers = [team.handle(TeamStatus(f"robot {n}", "s", 1, "0", 0.0)) for n in range(MAX_ROBOTS + 5)]
+    answers = [team.handle(TeamStatus(f"robot {n}", "s", 1, "0", NO_REPETITION)) for n in range(MAX_ROBOTS + 5)]
     assert sum(map(bool, answers)) == MAX_ROBOTS
 
 

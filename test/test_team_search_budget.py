@@ -9,6 +9,7 @@ from benchmark.lattice import Lattice
 from benchmark.team_load import measure_load
 from hmt_slam_ros.configuration import Configuration
 from hmt_slam_ros.logs.stamps import NANOSECONDS
+from hmt_slam_ros.messages.team import Repetition
 from hmt_slam_ros.team import search_budget
 from hmt_slam_ros.team import team as team_module
 from hmt_slam_ros.team.search_budget import SearchBudget
@@ -118,7 +119,7 @@ def test_maps_are_compared_in_turn_where_each_comparison_takes_several_events(mo
     monkeypatch.setattr(team_module, "judge", count)
     for event in range(60):
         for name in names:
-            eve.handle(replace(ann.status, robot=name, log_repetition=0.01 * (1 + event)))
+            eve.handle(replace(ann.status, robot=name, repetition=Repetition(0.01 * (1 + event), 1.0)))
         eve.search(10, may_wait=False)
     assert len(judged) == len(names)
     assert max(judged.values()) - min(judged.values()) <= 1

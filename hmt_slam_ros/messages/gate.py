@@ -294,8 +294,9 @@ def _check_team_message(message: TeamMessage | JoinedGround) -> None:
         for rate in message.clutter:
             _require(0.0 <= rate <= 1.0, "clutter", rate, "between 0 and 1")
     if isinstance(message, TeamStatus):
-        ratio, most = message.log_repetition, MAX_LOG_REPETITION
-        _require(abs(ratio) <= most, "log_repetition", ratio, f"within {most:g}")
+        (ratio, persistence), most = message.repetition, MAX_LOG_REPETITION
+        _require(abs(ratio) <= most, "repetition", ratio, f"within {most:g}")
+        _require(0.0 < persistence <= 1.0, "repetition", persistence, "above 0 and at most 1")
     elif isinstance(message, TeamUpdate | JoinedGround):
         _check_items(message.scans, message.areas)
     elif isinstance(message, TeamRendezvous):

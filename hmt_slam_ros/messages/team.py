@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 from hmt_slam_ros.geometry.gaussian import PoseGaussian
 from hmt_slam_ros.messages.map_changes import Arc, Pose
@@ -18,6 +19,21 @@ MAX_ROBOTS = 16
 
 MAX_LOG_REPETITION = 50.0
 """Largest log Bayes factor of a building that repeats itself, nats: its exponential stays finite."""
+
+
+class Repetition(NamedTuple):
+    """What the search of a map in itself shows of a building that repeats itself.
+
+    :ivar log_ratio: log Bayes factor of such a building, nats.
+    :ivar persistence: probability that what is alike goes on for one more window.
+    """
+
+    log_ratio: float
+    persistence: float
+
+
+NO_REPETITION = Repetition(0.0, 1.0)
+"""A map that shows nothing of that: a twin may be as large as the building."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -64,14 +80,14 @@ class TeamStatus:
     :ivar session: of its map; versions of another session are not comparable.
     :ivar map_version: 0 for an empty map.
     :ivar digest: of all items of that version, hexadecimal.
-    :ivar log_repetition: log Bayes factor of a building that repeats itself, from this map in itself, nats.
+    :ivar repetition: what the map shows in itself.
     """
 
     robot: str
     session: str
     map_version: int
     digest: str
-    log_repetition: float
+    repetition: Repetition
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from hmt_slam_ros.hybrid_map.pose_graph import consistent_map
 from hmt_slam_ros.hybrid_map.shortest_path import uninformative_belief
 from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions
 from hmt_slam_ros.messages.map_changes import Pose
+from hmt_slam_ros.messages.team import NO_REPETITION, Repetition
 from hmt_slam_ros.registration.consistency import MAPS_OUTLIER_RATE, NO_CLUTTER, Clutter
 from hmt_slam_ros.sensors import Scan
 
@@ -29,14 +30,14 @@ class Component:
     :ivar hybrid_map: its areas and arcs; it is not changed.
     :ivar scans: {keyframe: scan} of its keyframes.
     :ivar clutter: usual rate of contradictions of the map.
-    :ivar log_repetition: log Bayes factor of a building that repeats itself, from this map in itself, nats.
+    :ivar repetition: what the map shows in itself.
     :ivar pose: shape (3,), of its first area in the frame of the robot's map, of which it may be a piece.
     """
 
     hybrid_map: HybridMap
     scans: Mapping[int, Scan]
     clutter: Clutter = NO_CLUTTER
-    log_repetition: float = 0.0
+    repetition: Repetition = NO_REPETITION
     pose: Pose = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
@@ -45,20 +46,20 @@ class Component:
         hybrid_map: HybridMap,
         scans: Mapping[int, Scan],
         clutter: Clutter = NO_CLUTTER,
-        log_repetition: float = 0.0,
+        repetition: Repetition = NO_REPETITION,
     ) -> Component:
         """The component of a whole map.
 
         :param scans: of its keyframes at least.
         :param clutter: usual rate of contradictions of the map.
-        :param log_repetition: that of a building that repeats itself, nats.
+        :param repetition: what the map shows in itself.
         """
         areas = hybrid_map.area_ids()
         return cls(
             hybrid_map.subgraph(areas),
             {keyframe: scans[keyframe] for area in areas for keyframe in hybrid_map.keyframes(area)},
             clutter,
-            log_repetition,
+            repetition,
         )
 
 
@@ -80,7 +81,7 @@ class ComponentPair:
     :ivar first_keyframe: number from which on keyframes are those of the second.
     :ivar area_shift: added to the numbers of the second's areas.
     :ivar clutters: usual rates of contradictions of the first and of the second.
-    :ivar log_repetitions: log Bayes factors of a building that repeats itself, from the first map and the second, nats.
+    :ivar repetitions: what the first map shows in itself, and the second.
     :ivar poses: of the first areas of both in the frames of the robots' maps, each of shape (3,).
     """
 
@@ -91,7 +92,7 @@ class ComponentPair:
     first_keyframe: int
     area_shift: int
     clutters: tuple[Clutter, Clutter]
-    log_repetitions: tuple[float, float]
+    repetitions: tuple[Repetition, Repetition]
     poses: tuple[Pose, Pose]
 
     @property
@@ -146,7 +147,7 @@ def combine(first: Component, second: Component, shifts: Shift | None = None) ->
         first_keyframe=keyframe_shift,
         area_shift=area_shift,
         clutters=(first.clutter, second.clutter),
-        log_repetitions=(first.log_repetition, second.log_repetition),
+        repetitions=(first.repetition, second.repetition),
         poses=(first.pose, second.pose),
     )
 

@@ -30,6 +30,7 @@ from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.geometry.gaussian import PoseGaussian, chi_square_gate
 from hmt_slam_ros.hybrid_map.hybrid_map import HybridMap
 from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
+from hmt_slam_ros.messages.team import NO_REPETITION, Repetition
 from hmt_slam_ros.team.placement_evidence import (
     PlacementEvidence,
     WindowEvidence,
@@ -46,6 +47,9 @@ APART_PRIOR = 0.5
 
 _UNSEEN_AREAS = 8
 """Areas of a building that no component has, a priori: robots that begin in it are rarely at one place."""
+
+BEYOND = 0.5
+"""Probability that the twin of mapped ground, if there is one, is not mapped itself."""
 
 _REPETITION_PRIOR = 0.003
 """Prior odds of a building that repeats itself, so that ground has a twin (docs/decisions/0085-repetition.md)."""
@@ -93,33 +97,43 @@ class PlacementPrior(NamedTuple):
     """What is known of placements before any window was compared.
 
     :ivar places: number of areas of the building, in each of which the second component may begin.
-    :ivar log_repetitions: log Bayes factors of a building that repeats itself, from the first component and from the
-        second, nats.
+    :ivar repetitions: what either component shows in itself of a building that repeats itself.
     """
 
     places: int
-    log_repetitions: tuple[float, float]
+    repetitions: tuple[Repetition, Repetition]
 
     @classmethod
     def of_pair(
-        cls, known_areas: int, other_areas: int, log_repetitions: tuple[float, float] = (0.0, 0.0)
+        cls,
+        known_areas: int,
+        other_areas: int,
+        repetitions: tuple[Repetition, Repetition] = (NO_REPETITION, NO_REPETITION),
     ) -> PlacementPrior:
         """The prior that is flat over a building that is as large as both components together, and unseen areas.
 
         :param known_areas: number of areas of the first component.
         :param other_areas: number of areas of the second.
-        :param log_repetitions: log Bayes factors of a building that repeats itself, from either component, nats.
+        :param repetitions: what either shows in itself.
         """
-        return cls(known_areas + other_areas + _UNSEEN_AREAS, log_repetitions)
+        return cls(known_areas + other_areas + _UNSEEN_AREAS, repetitions)
 
-    def twin_probability(self, common: float) -> float:
-        """Probability of a building that repeats itself, so that ground of the first component has a twin.
+    def twin_ratio(self, windows: Mapping[int, WindowEvidence]) -> float:
+        """Probability that a twin of the first component's ground explains a placement, over that of common ground.
 
-        :param common: share of the second component that is in the first one's ground: the same evidence, not more.
+        A twin that neither component has may be as large as the building. Another one, which is in them, ends as there.
+
+        :param windows: evidence of the windows under the placement. Those in ground of the first component show it once
+            more, and are no further evidence of a building that repeats itself.
         """
-        first, second = self.log_repetitions
-        odds = _REPETITION_PRIOR * math.exp(first + (1.0 - common) * second)
-        return odds / (1.0 + odds)
+        first, second = self.repetitions
+        own = 1.0 - sum(window.is_in_place for window in windows.values()) / len(windows)
+        odds = _REPETITION_PRIOR * math.exp(first.log_ratio + own * second.log_ratio)
+        unseen = min(odds, _REPETITION_PRIOR * BEYOND ** (1.0 + own))
+        seen = odds - unseen
+        persistence = max(self.repetitions).persistence
+        log_end = max(0.0, placement_evidence(windows, persistence).agreement)
+        return unseen / (1.0 + unseen) + seen / (1.0 + seen) * math.exp(-log_end)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,15 +142,15 @@ class Placement:
 
     :ivar pose: shape (3,), ``first_T_second``, of the frames of the robots' maps.
     :ivar matches: {window: candidate} of those that agree, the best first.
+    :ivar windows: {window: its evidence}.
     :ivar evidence: of all windows.
-    :ivar common: share of the windows that it has in ground of the first component.
     :ivar probability: of the placement.
     """
 
     pose: Pose
     matches: Mapping[int, WindowCandidate]
+    windows: Mapping[int, WindowEvidence]
     evidence: PlacementEvidence
-    common: float
     probability: float = 0.0
 
 
@@ -281,8 +295,7 @@ def placement_distribution(
         matches = {w: each.matches[w] for w in sorted(each.matches, key=lambda w: (-own[w].log_ratio, w))}
         pose = geometry.component_pose(*joint, next(iter(matches.values())))
         similar = similar_probability(windows[:n] + windows[n + 1 :])
-        common = sum(window.is_in_place for window in own.values()) / len(own)
-        placements.append(Placement(pose, matches, placement_evidence(own, similar), common))
+        placements.append(Placement(pose, matches, own, placement_evidence(own, similar)))
     return weigh_placements(placements, prior)
 
 
@@ -294,7 +307,7 @@ def weigh_placements(placements: Sequence[Placement], prior: PlacementPrior) -> 
     share = (1.0 - APART_PRIOR) / prior.places
     false_agreement = sorted([0.0, 0.0, *(each.evidence.agreement for each in placements)])[-2]
     logs = np.array([math.log(share) + sum(each.evidence) - false_agreement for each in placements])
-    log_twins = np.log([prior.twin_probability(each.common) for each in placements])
+    log_twins = np.log([prior.twin_ratio(each.windows) for each in placements])
     apart = np.append(logs + log_twins, math.log(max(APART_PRIOR, 1.0 - share * len(placements))))
     weights = scipy.special.softmax(np.append(logs, scipy.special.logsumexp(apart))).tolist()
     weighed = [replace(each, probability=p) for each, p in zip(placements, weights[:-1], strict=True)]

@@ -22,7 +22,7 @@ _SIMILAR_MEAN, _SIMILAR_WEIGHT = math.exp(-8.0 / 5.0), 2.0
 From docs/decisions/0068-after-a-gap.md.
 """
 
-_AGREES = 0.5
+AGREES = 0.5
 """Log Bayes factor above which a window of a false placement fits by chance, nats."""
 
 
@@ -58,11 +58,11 @@ def similar_probability(others: Sequence[Mapping[int, WindowEvidence]]) -> float
         if not windows:
             continue
         best = _best(windows)
-        if windows[best].log_ratio <= _AGREES:
+        if windows[best].log_ratio <= AGREES:
             continue
         rest = [own for window, own in windows.items() if window != best and own.is_in_place]
         tested += len(rest)
-        fitting += sum(own.log_ratio > _AGREES for own in rest)
+        fitting += sum(own.log_ratio > AGREES for own in rest)
     return (_SIMILAR_MEAN * _SIMILAR_WEIGHT + fitting) / (_SIMILAR_WEIGHT + tested)
 
 

@@ -155,7 +155,7 @@ class PlacementSearch:
         """
         pair, windows = self.pair, self.windows[: len(self._in_order) - left_out]
         candidates = [self._candidates(number, each) for number, each in enumerate(self._in_order[: len(windows)])]
-        prior = PlacementPrior.of_pair(len(pair.known), len(pair.other), pair.log_repetitions)
+        prior = PlacementPrior.of_pair(len(pair.known), len(pair.other), pair.repetitions)
         geometry = PlacementGeometry(pair.hybrid_map, windows)
         comparison = PlaceComparison(pair, windows, geometry, self._configuration, self._map_search.grid_cache)
         found = placement_distribution(geometry, candidates, pair.joint, prior, comparison.log_ratio)

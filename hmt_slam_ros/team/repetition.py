@@ -14,39 +14,43 @@ and q the probability that the twin lies beyond the map. Parts that were not sea
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import scipy
 
 from hmt_slam_ros.configuration.tree import Configuration
 from hmt_slam_ros.geometry import se2
 from hmt_slam_ros.hybrid_map.shortest_path import connected_areas
 from hmt_slam_ros.hybrid_map.surroundings import keyframe_positions, stack_poses
-from hmt_slam_ros.messages.team import MAX_LOG_REPETITION
+from hmt_slam_ros.messages.team import MAX_LOG_REPETITION, NO_REPETITION, Repetition
 from hmt_slam_ros.team.components import Component, ComponentPair, Shift, combine
+from hmt_slam_ros.team.placement import BEYOND, Placement
+from hmt_slam_ros.team.placement_evidence import AGREES
 from hmt_slam_ros.team.placement_search import PlacementSearch
-from hmt_slam_ros.team.windows import GROUND_RADIUS, Window
+from hmt_slam_ros.team.windows import MAX_LENGTH, Window
 
-_BEYOND = 0.5
-"""Probability that the twin of mapped ground, if there is one, is not mapped itself."""
+_ENDS = -1.0
+"""Log Bayes factor of a window below which what is alike has ended there, nats."""
 
-_MIN_SHIFT = 6.0
-"""Least distance of a window from its own copy, m: nearer, it shows the same ground."""
+_PERSISTENCE_WEIGHT = 2.0
+"""Windows for which a twin goes on a priori: one that was not seen to end may be as large as the building."""
 
 _DIGITS = 2
-"""Decimal digits of a log Bayes factor: others are nothing new."""
+"""Decimal digits of a log Bayes factor and of a probability: others are nothing new."""
 
 
 class RepetitionTest:
     """Searches a map in itself, while it grows: a bounded step at a time.
 
-    :ivar log_ratio: log Bayes factor of a building that repeats itself, as of the end of the last search, nats.
+    :ivar repetition: what the map shows, as of the end of the last search.
     :ivar is_done: whether the search is at its end.
     """
 
     def __init__(self, configuration: Configuration) -> None:
         self._search = PlacementSearch(configuration, _OverlappingAreas)
-        self.log_ratio, self.is_done = 0.0, True
+        self.repetition, self.is_done = NO_REPETITION, True
 
     def update(self, component: Component, shift: Shift | None = None) -> None:
         """Go on with a map that grew or changed.
@@ -58,11 +62,11 @@ class RepetitionTest:
         self.is_done = False
 
     def step(self) -> int:
-        """Take the next step, and return its work; at the end ``log_ratio`` is new."""
+        """Take the next step, and return its work; at the end ``repetition`` is new."""
         work = self._search.step()
         if work is None:
             before = self._search.comparison_work
-            self.log_ratio, self.is_done = _log_ratio(self._search), True
+            self.repetition, self.is_done = _repetition(self._search), True
             work = self._search.comparison_work - before
         return work
 
@@ -73,7 +77,7 @@ def add_repetition(component: Component, configuration: Configuration) -> Compon
     test.update(component)
     while not test.is_done:
         test.step()
-    return replace(component, log_repetition=test.log_ratio)
+    return replace(component, repetition=test.repetition)
 
 
 class _OverlappingAreas:
@@ -91,12 +95,24 @@ class _OverlappingAreas:
         pose = self._poses[window.area - self._shift].mean
         positions = se2.compose(se2.compose(pose, window.reference), stack_poses(window.poses))[:, :2]
         distances = np.hypot(*(self._positions[:, None] - positions).transpose(2, 0, 1)).min(axis=1)
-        return frozenset(np.unique(self._areas[distances <= GROUND_RADIUS + _MIN_SHIFT]).tolist())
+        return frozenset(np.unique(self._areas[distances <= MAX_LENGTH]).tolist())
 
 
-def _log_ratio(search: PlacementSearch) -> float:
+def _repetition(search: PlacementSearch) -> Repetition:
+    placements = search.distribution().placements
+    log_ratios = [min(sum(each.evidence), MAX_LOG_REPETITION) for each in placements]
     possible = len(search.pair.known) * max(1, len(search.windows))
-    ratios = [min(sum(each.evidence), MAX_LOG_REPETITION) for each in search.distribution().placements]
-    mean = (float(np.exp(ratios).sum()) + possible - search.searched_count) / possible
-    log_ratio = math.log(_BEYOND + (1.0 - _BEYOND) * mean)
-    return round(min(log_ratio, MAX_LOG_REPETITION), _DIGITS)
+    mean = (float(np.exp(log_ratios).sum()) + possible - search.searched_count) / possible
+    log_ratio = math.log(BEYOND + (1.0 - BEYOND) * mean)
+    return Repetition(round(min(log_ratio, MAX_LOG_REPETITION), _DIGITS), _persistence(placements, log_ratios))
+
+
+def _persistence(placements: Sequence[Placement], log_ratios: Sequence[float]) -> float:
+    """Probability that a twin goes on for one more window, from placements of a map in itself and their evidence."""
+    goes_on, ends = _PERSISTENCE_WEIGHT, 0.0
+    weights = scipy.special.softmax(log_ratios).tolist() if placements else []
+    for placement, weight in zip(placements, weights, strict=True):
+        windows = [own.log_ratio for own in placement.windows.values() if own.is_in_place]
+        goes_on += weight * sum(own > AGREES for own in windows)
+        ends += weight * sum(own < _ENDS for own in windows)
+    return float(round(goes_on / (goes_on + ends), _DIGITS))

@@ -24,7 +24,7 @@ from hmt_slam_ros.hybrid_map.pose_graph import consistent_poses
 from hmt_slam_ros.hybrid_map.shortest_path import map_pieces, shortest_path_beliefs
 from hmt_slam_ros.messages.map_changes import Arc, Pose
 from hmt_slam_ros.messages.replica import Replica
-from hmt_slam_ros.messages.team import SharedArea, SharedItem, SharedScan, TeamUpdate
+from hmt_slam_ros.messages.team import NO_REPETITION, Repetition, SharedArea, SharedItem, SharedScan, TeamUpdate
 from hmt_slam_ros.plain_data import to_plain
 from hmt_slam_ros.registration.consistency import NO_CLUTTER, Clutter
 from hmt_slam_ros.sensors import Scan
@@ -260,7 +260,7 @@ class ForeignMapState:
     :ivar version: up to which it is known, 0 for nothing.
     :ivar scans: of its keyframes, and those of areas that are still to come; ``areas`` likewise.
     :ivar clutter: usual rate of contradictions of the map.
-    :ivar log_repetition: log Bayes factor of a building that repeats itself, from this map in itself, nats.
+    :ivar repetition: what the map shows in itself.
     """
 
     session: str
@@ -268,7 +268,7 @@ class ForeignMapState:
     scans: tuple[SharedScan, ...] = ()
     areas: tuple[SharedArea, ...] = ()
     clutter: Clutter = NO_CLUTTER
-    log_repetition: float = 0.0
+    repetition: Repetition = NO_REPETITION
 
 
 class ForeignMap:
@@ -276,13 +276,13 @@ class ForeignMap:
 
     :ivar session: of the map.
     :ivar version: up to which it is known, 0 for nothing.
-    :ivar log_repetition: log Bayes factor of a building that repeats itself, from this map in itself, nats.
+    :ivar repetition: what the map shows in itself.
     """
 
     def __init__(self, state: ForeignMapState) -> None:
         """:param state: to go on from."""
         self.session, self.version, self._clutter = state.session, state.version, state.clutter
-        self.log_repetition = state.log_repetition
+        self.repetition = state.repetition
         self._areas = {area.area: area for area in state.areas}
         self._scans = {scan.keyframe: scan for scan in state.scans}
 
@@ -290,7 +290,7 @@ class ForeignMap:
     def state(self) -> ForeignMapState:
         """The map as a value."""
         scans, areas = tuple(self._scans.values()), tuple(self._areas.values())
-        return ForeignMapState(self.session, self.version, scans, areas, self._clutter, self.log_repetition)
+        return ForeignMapState(self.session, self.version, scans, areas, self._clutter, self.repetition)
 
     @property
     def scan_count(self) -> int:
@@ -345,7 +345,7 @@ class ForeignMap:
         hybrid_map.commit()
         scans = {keyframe: item.scan for keyframe, item in self._scans.items()}
         areas, pose = _largest_piece(hybrid_map)
-        found = Component.of_map(hybrid_map.subgraph(areas), scans, self._clutter, self.log_repetition)
+        found = Component.of_map(hybrid_map.subgraph(areas), scans, self._clutter, self.repetition)
         return replace(found, pose=pose)
 
 

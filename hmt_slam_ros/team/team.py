@@ -147,7 +147,7 @@ class Team:
     def status(self) -> TeamStatus:
         """What the others have to know of the map that is shared."""
         shared = self._shared
-        return TeamStatus(self._robot, shared.session, shared.version, shared.digest, self._own.log_repetition)
+        return TeamStatus(self._robot, shared.session, shared.version, shared.digest, self._own.repetition)
 
     @property
     def session(self) -> str:
@@ -235,9 +235,9 @@ class Team:
             known = self._others[name] = _Other(ForeignMapState(status.session))
             self._pairs[name] = _PairState(self._configuration, JoinState())
             self._forget_placements(name)
-        is_again = known.map.log_repetition == status.log_repetition
+        is_again = known.map.repetition == status.repetition
         if not is_again:
-            known.map.log_repetition, self._pairs[name].is_outdated = status.log_repetition, True
+            known.map.repetition, self._pairs[name].is_outdated = status.repetition, True
         is_stuck = is_again and (known.newest, known.arrived) == (status.map_version, known.map.version)
         known.newest, known.arrived = max(known.newest, status.map_version), known.map.version
         if known.requested == known.map.version and not is_stuck:
@@ -332,9 +332,9 @@ class Team:
                 budget.spend(_KEYFRAME_WORK * 2 * own.scan_count)
         while budget.is_left and not test.is_done:
             budget.spend(test.step())
-        if not test.is_done or test.log_ratio == own.log_repetition:
+        if not test.is_done or test.repetition == own.repetition:
             return []
-        own.log_repetition = test.log_ratio
+        own.repetition = test.repetition
         for pair in self._pairs.values():
             pair.is_outdated = True
         return [self.status]

@@ -14,7 +14,7 @@ from hmt_slam_ros.hybrid_map.shortest_path import shortest_path_beliefs
 
 Pose = Float64
 
-_MAX_LENGTH = 8.0
+MAX_LENGTH = 8.0
 """Length of the path in a window, m: with more the map may bend, with less places look alike."""
 
 GROUND_RADIUS = 4.0
@@ -106,7 +106,7 @@ def _window_from(hybrid_map: HybridMap, keyframes: Sequence[tuple[int, int]]) ->
             break
         pose = se2.between(start, se2.compose(frames[own].mean, hybrid_map.keyframes(own)[keyframe]))
         step = float(np.hypot(*(pose - last)[:2]))
-        if step > _MAX_STEP or length + step > _MAX_LENGTH:
+        if step > _MAX_STEP or length + step > MAX_LENGTH:
             break
         poses[keyframe] = pose
         last, length = pose, length + step
