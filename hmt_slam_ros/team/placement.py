@@ -121,7 +121,8 @@ class PlacementPrior(NamedTuple):
     def twin_ratio(self, windows: Mapping[int, WindowEvidence]) -> float:
         """Probability that a twin of the first component's ground explains a placement, over that of common ground.
 
-        A twin that neither component has may be as large as the building. Another one, which is in them, ends as there.
+        A twin that neither component has may be as large as the building. One that is in them ends as it does in the
+        component with the larger Bayes factor (docs/decisions/0098-twins-end.md).
 
         :param windows: evidence of the windows under the placement. Those in ground of the first component show it once
             more, and are no further evidence of a building that repeats itself.
@@ -131,8 +132,8 @@ class PlacementPrior(NamedTuple):
         odds = _REPETITION_PRIOR * math.exp(first.log_ratio + own * second.log_ratio)
         unseen = min(odds, _REPETITION_PRIOR * BEYOND ** (1.0 + own))
         seen = odds - unseen
-        persistence = max(self.repetitions).persistence
-        log_end = max(0.0, placement_evidence(windows, persistence).agreement)
+        likelier = max(self.repetitions)
+        log_end = max(0.0, placement_evidence(windows, likelier.persistence).agreement)
         return unseen / (1.0 + unseen) + seen / (1.0 + seen) * math.exp(-log_end)
 
 

@@ -8,7 +8,8 @@ false. With R the repetition,
     log P(map | R) / P(map | not R) = log(q + (1 - q) mean over placements of P(windows | twin) / P(windows | chance))
 
 and q the probability that the twin lies beyond the map. Parts that were not searched are no evidence: they count 1
-(docs/decisions/0085-repetition.md).
+(docs/decisions/0085-repetition.md). How many windows of a twin fit before it ends shows how far what is alike goes on
+(docs/decisions/0098-twins-end.md).
 """
 
 from __future__ import annotations
