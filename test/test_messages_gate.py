@@ -10,7 +10,7 @@ from hmt_slam_ros.messages.documents import SaveRequest, SaveResponse, encode
 from hmt_slam_ros.messages.gate import ChainGate, check_message, check_save_folder, decode_checked
 from hmt_slam_ros.messages.messages import ClosureDecision, Hypotheses, Hypothesis, LocalEstimate
 from hmt_slam_ros.messages.system_name import ForeignDocumentError, SystemName
-from hmt_slam_ros.messages.team import TeamGoal, TeamPlace
+from hmt_slam_ros.messages.team import Repetition, TeamGoal, TeamPlace, TeamStatus
 from hmt_slam_ros.saved_map.folder import FileRecord
 
 
@@ -36,6 +36,9 @@ def estimate(covariance, x=0.0):
         SaveRequest(1, -1, "", False),
         SaveResponse(1, "stranger", ()),
         SaveResponse(1, "aam", (FileRecord("../aam.json", 1, ""),)),
+        TeamStatus("ann", "1", 1, "0", Repetition(1000.0, 1.0)),
+        TeamStatus("ann", "1", 1, "0", Repetition(0.0, 0.0)),
+        TeamStatus("ann", "1", 1, "0", Repetition(0.0, 1.5)),
         TeamGoal("ann", 9, False, False, TeamPlace("bob", 7, np.zeros(3)), False, -1.0),
         TeamGoal("ann", 9, False, False, TeamPlace("bob", 7, np.full(3, 1e8)), False, 5.0),
         TeamGoal("ann", 9, False, False, TeamPlace("bob", -7, np.zeros(3)), False, 5.0),
