@@ -9,6 +9,7 @@ import socket
 import time
 from collections import Counter
 from pathlib import Path
+from threading import Thread
 from urllib.request import urlopen
 
 import numpy as np
@@ -25,6 +26,7 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.qos import HistoryPolicy, QoSProfile
 from recording import Recording
 from std_msgs.msg import Float64MultiArray, String
+from test_ros_hostile import watch_page
 from visualization_msgs.msg import MarkerArray
 
 from hmt_slam_ros.configuration import Configuration
@@ -109,9 +111,11 @@ def test_a_run_of_the_bundled_log_shows_itself_on_the_topics_in_a_browser_and_fr
     port = free_port()
     nodes = [start("view", port=port)]
     page = Page(browser, listener, nodes)
+    listener.until(lambda: is_served(port), alive=nodes)
     if browser is not None:
-        listener.until(lambda: is_served(port), alive=nodes)
         open_before_anything_runs(page, port)
+    else:
+        Thread(target=watch_page, args=(port,), daemon=True).start()
     nodes += [start(name) for name in PROCESSES]
     # At full speed a reader may miss poses, since a stream keeps the last 100.
     nodes.append(start("robot", log=BUNDLED, robot__rate=8.0))
