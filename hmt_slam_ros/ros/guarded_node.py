@@ -12,11 +12,13 @@ from collections.abc import Callable
 from functools import wraps
 from typing import TYPE_CHECKING, Any
 
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
 from hmt_slam_ros.errors import HmtSlamError
 from hmt_slam_ros.messages.system_name import ForeignDocumentError
+from hmt_slam_ros.ros.topics import BETWEEN_NODES
 from hmt_slam_ros.untrusted_input import shorten
 
 if TYPE_CHECKING:
@@ -33,8 +35,22 @@ class GuardedNode(Node):
 
     diagnostics: NodeDiagnostics
 
+    def create_publisher(self, msg_type: type, topic: str, *options: Any, **named: Any) -> Any:  # noqa: ANN401  rclpy's
+        """As rclpy's, without its warning of subscriptions that do not match, which warn in their own program.
+
+        Each event of the middleware is one more entity that the executor looks at before every callback
+        (docs/decisions/0099-events-of-the-middleware.md).
+        """
+        named.setdefault("event_callbacks", PublisherEventCallbacks(use_default_callbacks=False))
+        return super().create_publisher(msg_type, topic, *options, **named)
+
     def create_subscription(self, msg_type: type, topic: str, callback: Callback, *options: Any, **named: Any) -> Any:  # noqa: ANN401  rclpy's
-        """As rclpy's; a message on which the callback raises an error is refused."""
+        """As rclpy's; a message on which the callback raises an error is refused.
+
+        It warns of publishers that do not match, where these may be of other programs.
+        """
+        if topic in BETWEEN_NODES:
+            named.setdefault("event_callbacks", SubscriptionEventCallbacks(use_default_callbacks=False))
         return super().create_subscription(msg_type, topic, self.guard(topic, callback), *options, **named)
 
     def create_service(self, srv_type: type, srv_name: str, callback: Callback, **options: Any) -> Any:  # noqa: ANN401  rclpy's

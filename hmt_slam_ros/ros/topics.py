@@ -89,6 +89,9 @@ INCIDENTS = "hmt/incidents"
 DOCUMENTS: dict[type, str] = {row.message_class: row.topic for row in process_table.DOCUMENTS}
 """{class of a message that travels as a document: topic}."""
 
+BETWEEN_NODES = frozenset({*DOCUMENTS.values(), KEYFRAME_SCANS, DIAGNOSTICS, COST})
+"""Topics on which nodes of the package listen to one another, with profiles that match."""
+
 
 def transform_publisher(node: Node, topic: str) -> Callable[[list[TransformStamped]], None]:
     """Function that publishes transforms on ``tf`` or ``tf_static``; without tf2_msgs it only logs a warning once."""
