@@ -88,6 +88,11 @@ def is_served(port):
         return client.connect_ex(("127.0.0.1", port)) == 0
 
 
+def map_picture(port):
+    with urlopen(f"http://127.0.0.1:{port}/map.png", timeout=20) as answer:
+        return answer.read()
+
+
 def snapshot(port):
     with urlopen(f"http://127.0.0.1:{port}/snapshot.json", timeout=20) as answer:
         return json.load(answer)
@@ -171,19 +176,18 @@ def assert_recorded_page(recording, view, live_port):
     with urlopen(f"http://127.0.0.1:{live_port}/news", timeout=20):
         wait_for(lambda: {"map", "landmarks"} <= snapshot(live_port).keys(), view)
     recording.close()
-    live, port = snapshot(live_port), free_port()
+    live, picture, port = snapshot(live_port), map_picture(live_port), free_port()
     with preloaded.start(preloaded.COMMAND, "view", recording.folder, "--rate", "0", "--port", port) as viewer:
         wait_for(lambda: is_served(port), viewer)
         with urlopen(f"http://127.0.0.1:{port}/news", timeout=20):
             wait_for(lambda: "map" in snapshot(port) and snapshot(port)["recording"]["ended"], viewer)
-        recorded = snapshot(port)
-        pictures = [urlopen(f"http://127.0.0.1:{n}/map.png", timeout=20).read() for n in (live_port, port)]
+        recorded, recorded_picture = snapshot(port), map_picture(port)
         viewer.send_signal(signal.SIGINT)
     assert viewer.returncode == 0
     assert recorded.keys() == live.keys() | {"recording"}
     for section in live.keys() - TIMED:
         assert recorded[section] == live[section], section
-    assert pictures[0] == pictures[1]
+    assert recorded_picture == picture
     rows = [{(row["name"], row["level"], row["message"]) for row in page["nodes"]} for page in (live, recorded)]
     assert rows[0] == rows[1]
     assert {row["topic"] for row in live["topics"] if row["age"] is not None} == {
